@@ -1,0 +1,72 @@
+"""Conversions between SI (inside) and the units of people, configs and wires (outside).
+
+Every function takes and returns a float or an array of any shape.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+T = TypeVar("T", float, NDArray[np.float64])
+
+_RAD_PER_DEG = math.pi / 180.0
+_RAD_PER_ARCMIN = _RAD_PER_DEG / 60.0
+
+
+def deg_to_rad(angle_deg: T) -> T:
+    """Degrees as radians."""
+    return angle_deg * _RAD_PER_DEG
+
+
+def rad_to_deg(angle_rad: T) -> T:
+    """Radians as degrees."""
+    return angle_rad / _RAD_PER_DEG
+
+
+def arcmin_to_rad(angle_arcmin: T) -> T:
+    """Minutes of arc as radians."""
+    return angle_arcmin * _RAD_PER_ARCMIN
+
+
+def rad_to_arcmin(angle_rad: T) -> T:
+    """Radians as minutes of arc."""
+    return angle_rad / _RAD_PER_ARCMIN
+
+
+def rad2_to_arcmin2(area_rad2: T) -> T:
+    """Square radians as square minutes of arc (areas of point spread functions)."""
+    return area_rad2 / _RAD_PER_ARCMIN**2
+
+
+def rad2_to_deg2(area_rad2: T) -> T:
+    """Square radians as square degrees (covariances in machine-readable files)."""
+    return area_rad2 / _RAD_PER_DEG**2
+
+
+def cm_to_m(length_cm: T) -> T:
+    """Centimetres (facet lists of the simulations) as metres."""
+    return length_cm / 100.0
+
+
+def m_to_cm(length_m: T) -> T:
+    """Metres as centimetres (facet lists of the simulations)."""
+    return length_m * 100.0
+
+
+def mm_to_m(length_mm: T) -> T:
+    """Millimetres as metres."""
+    return length_mm / 1000.0
+
+
+def m_to_mm(length_m: T) -> T:
+    """Metres as millimetres (what a person reads of legs and bolts)."""
+    return length_m * 1000.0
+
+
+def ms_to_s(time_ms: T) -> T:
+    """Milliseconds as seconds."""
+    return time_ms / 1000.0

@@ -1,0 +1,79 @@
+"""The conventions of frames and signs, defined here once; nothing else ever flips a sign.
+
+Telescope frame: right-handed, origin at the dish vertex, +z along the optical axis to the sky; a person at
+the focal point looking down at the reflector sees +x to the right and +y up.
+
+Theta = (theta_x, theta_y): the star stands in direction (tan theta_x, tan theta_y, 1) of the telescope frame.
+
+Facet tilt t = (t_x, t_y): the facet's normal is its aligned normal + (t_x, t_y, 0). The facet is brightest at
+Theta = 2 t, so the correction that is added to the normal is Phi = -Theta / 2.
+
+Pixels: (x, y) = (column, row), centre of the first pixel at (0, 0).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def theta_of_tilt(tilt_rad: Array) -> Array:
+    """Star direction at which a facet of that tilt is brightest; arrays of shape (..., 2), rad."""
+    return 2.0 * tilt_rad
+
+
+def correction_of_theta(theta_rad: Array) -> Array:
+    """Phi, to be added to the facet's normal, for a facet that is brightest at `theta_rad`; (..., 2), rad."""
+    return -theta_rad / 2.0
+
+
+def direction_to_star(theta_rad: Array) -> Array:
+    """Unit vectors of shape (..., 3) that point at a star of direction `theta_rad` (..., 2), telescope frame."""
+    vector = np.concatenate([np.tan(theta_rad), np.ones((*theta_rad.shape[:-1], 1))], axis=-1)
+    unit: Array = vector / np.linalg.norm(vector, axis=-1, keepdims=True)
+    return unit
+
+
+@dataclass(frozen=True, slots=True)
+class CameraOrientation:
+    """How a camera's pixel axes lie in the telescope frame.
+
+    An image that is "upright" has telescope +x along its columns (to the right) and +y against its rows (up).
+    `is_mirrored` swaps left and right of that first; then the frame is turned by `rotation_rad`,
+    counter-clockwise as seen in the telescope frame (from the focal point down at the reflector).
+    """
+
+    rotation_rad: float = 0.0
+    is_mirrored: bool = False
+
+    @property
+    def image_to_telescope(self) -> Array:
+        """Matrix of shape (2, 2) that turns offsets (column, row) into offsets along telescope (x, y)."""
+        upright = np.array([[-1.0 if self.is_mirrored else 1.0, 0.0], [0.0, -1.0]])
+        cosine, sine = np.cos(self.rotation_rad), np.sin(self.rotation_rad)
+        matrix: Array = np.array([[cosine, -sine], [sine, cosine]]) @ upright
+        return matrix
+
+
+def pixel_to_theta(pixel: Array, axis_pixel: Array, plate_scale_rad: float, orientation: CameraOrientation) -> Array:
+    """Theta in rad, shape (..., 2), of image positions `pixel` (x, y) of shape (..., 2).
+
+    `axis_pixel` is where the telescope's axis lies in the image, `plate_scale_rad` the angle of one pixel
+    at the axis. The scale is linear in the angle, as the field's star cameras are calibrated
+    (arXiv:1605.06274, section 3: 2.437 mdeg per pixel).
+    """
+    offset = np.asarray(pixel, dtype=np.float64) - axis_pixel
+    theta: Array = plate_scale_rad * offset @ orientation.image_to_telescope.T
+    return theta
+
+
+def theta_to_pixel(
+    theta_rad: Array, axis_pixel: Array, plate_scale_rad: float, orientation: CameraOrientation
+) -> Array:
+    """Image position (x, y) of shape (..., 2) of star directions `theta_rad`: the inverse of `pixel_to_theta`."""
+    pixel: Array = np.asarray(theta_rad) / plate_scale_rad @ orientation.image_to_telescope + axis_pixel
+    return pixel

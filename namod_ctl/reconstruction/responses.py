@@ -1,0 +1,68 @@
+"""The response table: normalized responses of all facets over the directions of the star."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from namod_ctl.core.records import Record
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ResponseTable:
+    """Accepted records as arrays.
+
+    Attributes
+    ----------
+    facet_ids
+        Order of the facets along the last axis of `response`.
+    record_index
+        Shape (n_records,). Number of each record in its run.
+    theta_rad
+        Shape (n_records, 2). Direction of the star, telescope frame.
+    theta_uncertainty_rad
+        Shape (n_records,). One standard deviation per axis; NaN when unknown.
+    response
+        Shape (n_records, n_facets). R_ij = m_ij / s_i (arXiv:1605.06274, eq. of section 2); NaN where not measured.
+    """
+
+    facet_ids: tuple[int, ...]
+    record_index: NDArray[np.int64]
+    theta_rad: Array
+    theta_uncertainty_rad: Array
+    response: Array
+
+    @property
+    def n_records(self) -> int:
+        """Number of accepted records."""
+        return len(self.record_index)
+
+    def select(self, keep: NDArray[np.bool_] | NDArray[np.int64]) -> ResponseTable:
+        """The table of the chosen records only (mask or indices along the first axis)."""
+        return ResponseTable(
+            self.facet_ids,
+            self.record_index[keep],
+            self.theta_rad[keep],
+            self.theta_uncertainty_rad[keep],
+            self.response[keep],
+        )
+
+
+def tabulate_responses(records: Iterable[Record], facet_ids: Sequence[int]) -> ResponseTable:
+    """Response table of the records that count; rejected ones are left out."""
+    accepted = [record for record in records if record.reject_reason is None]
+    n = len(accepted)
+    intensity = np.array([record.facet_intensity for record in accepted], dtype=np.float64).reshape(n, len(facet_ids))
+    star = np.array([record.star_intensity for record in accepted], dtype=np.float64)
+    return ResponseTable(
+        tuple(facet_ids),
+        np.array([record.index for record in accepted], dtype=np.int64),
+        np.array([record.theta_rad for record in accepted], dtype=np.float64).reshape(n, 2),
+        np.array([record.theta_uncertainty_rad for record in accepted], dtype=np.float64),
+        intensity / star[:, None],
+    )
