@@ -7,6 +7,10 @@ import sys
 import typer
 
 from namod_ctl import __version__
+from namod_ctl.app.commands import config, imports
+from namod_ctl.app.commands.export import export
+from namod_ctl.app.commands.instruct import instruct
+from namod_ctl.app.commands.raytrace import raytrace
 from namod_ctl.core.errors import NamodError
 
 app = typer.Typer(
@@ -29,6 +33,15 @@ def _root(
     version: bool = typer.Option(False, "--version", callback=_print_version, is_eager=True, help="Print the version."),
 ) -> None:
     pass
+
+
+app.command("raytrace")(raytrace)
+app.command("instruct")(instruct)
+app.command("export")(export)
+
+
+app.add_typer(imports.app, name="import")
+app.add_typer(config.app, name="config")
 
 
 def main() -> None:

@@ -31,6 +31,45 @@ def correction_of_theta(theta_rad: Array) -> Array:
     return -theta_rad / 2.0
 
 
+def theta_of_hit(hit_m: Array, focal_length_m: float, theta_rad: Array) -> Array:
+    """Star direction that would throw light on the focal point, of light that now hits the focal plane at `hit_m`.
+
+    A mirror image moves against the star: the perfect image of a star at Theta lies at -focal_length * tan(Theta).
+    Light of a star at `theta_rad` that arrives at `hit_m` therefore arrives at the focal point once the star has
+    moved by +arctan(hit / focal_length). So a facet of tilt t, whose light of an on-axis star arrives at
+    +2 t * focal_length, is brightest at Theta = 2 t. To first order in the move of the star.
+
+    Parameters
+    ----------
+    hit_m
+        Shape (..., 2). Position in the focal plane, telescope x and y.
+    theta_rad
+        Shape (2,). Direction of the star whose light it is.
+
+    Returns
+    -------
+    Shape (..., 2), rad, on the same axes as the response maps.
+    """
+    theta: Array = np.asarray(theta_rad) + np.arctan(np.asarray(hit_m) / focal_length_m)
+    return theta
+
+
+def rotation_to_normal(normal: Array) -> Array:
+    """Matrix of shape (3, 3) that turns +z onto the unit vector `normal` (3,) the shortest way, without twist.
+
+    Its columns are the x, y and z axes of a facet in the telescope frame. `normal` must not be -z.
+    """
+    x, y, z = normal
+    share = 1.0 / (1.0 + z)
+    return np.array(
+        [
+            [1.0 - x * x * share, -x * y * share, x],
+            [-x * y * share, 1.0 - y * y * share, y],
+            [-x, -y, z],
+        ]
+    )
+
+
 def direction_to_star(theta_rad: Array) -> Array:
     """Unit vectors of shape (..., 3) that point at a star of direction `theta_rad` (..., 2), telescope frame."""
     vector = np.concatenate([np.tan(theta_rad), np.ones((*theta_rad.shape[:-1], 1))], axis=-1)

@@ -59,11 +59,11 @@ def histogram_responses(table: ResponseTable, bin_size_rad: float) -> ResponseHi
     """
     lowest = np.floor(table.theta_rad.min(axis=0) / bin_size_rad).astype(np.int64)
     n_columns, n_rows = np.floor(table.theta_rad.max(axis=0) / bin_size_rad).astype(np.int64) - lowest + 1
-    column, row = (np.floor(table.theta_rad / bin_size_rad).astype(np.int64) - lowest).T
-    flat = row * n_columns + column
+    ix, iy = (np.floor(table.theta_rad / bin_size_rad).astype(np.int64) - lowest).T
+    flat = iy * n_columns + ix
     n_bins = int(n_rows * n_columns)
     response = np.nan_to_num(table.response)
-    raw = np.stack([np.bincount(flat, weights=response[:, j], minlength=n_bins) for j in range(response.shape[1])])
+    raw: Array = np.array([np.bincount(flat, weights=column, minlength=n_bins) for column in response.T])
     return ResponseHistograms(
         bin_size_rad * np.arange(lowest[0], lowest[0] + n_columns + 1),
         bin_size_rad * np.arange(lowest[1], lowest[1] + n_rows + 1),

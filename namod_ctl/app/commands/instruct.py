@@ -1,0 +1,140 @@
+"""`namod-ctl instruct`: what the people at the telescope shall turn, as a list, a picture and sheets."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import Annotated
+
+import cv2
+import numpy as np
+import typer
+from numpy.typing import NDArray
+
+from namod_ctl.app.alignment_files import read_alignment
+from namod_ctl.app.build import build_instrument
+from namod_ctl.app.config import InstrumentConfig
+from namod_ctl.app.figure_style import figure_to_png
+from namod_ctl.app.instruction_sheets import PDF_FILE, sheets_to_pdf
+from namod_ctl.app.instructions import (
+    CSV_FILE,
+    FacetInstruction,
+    Verdict,
+    facet_instructions,
+    instructions_to_csv,
+)
+from namod_ctl.app.overlay import PNG_FILE, draw_instructions
+from namod_ctl.core.errors import ConfigError, StoreError
+from namod_ctl.optics.instrument import Instrument
+from namod_ctl.reconstruction.alignment import Alignment
+from namod_ctl.store.frames import write_file_durably
+from namod_ctl.store.run import RunStore
+
+Image = NDArray[np.uint8]
+
+_MOST_FRAMES = 30  # of a run are laid over each other; more show nothing new
+
+
+def instruct(
+    run: Annotated[Path, typer.Argument(help="Folder of a run that was reconstructed.")],
+    image: Annotated[
+        Path | None,
+        typer.Option(help="Picture of the reflector, the camera's whole frame at any size. Default: the run's frames."),
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the files. Default: the run's own folder.")] = None,
+) -> None:
+    """Write instructions.csv, instructions.png and instructions.pdf for the people who turn the bolts.
+
+    Facets without a trustworthy estimate are marked "do not turn" and carry no numbers.
+
+    Example: namod-ctl instruct runs/2014-05 --image reflector.png
+    """
+    with RunStore.open(run) as store:
+        instrument = build_instrument(InstrumentConfig.from_json(store.config_json, f"{run}: config"))
+        alignment = read_alignment(run)
+        _refuse_unknown_facets(alignment, instrument, run)
+        picture = read_picture(image) if image is not None else _picture_of_run(store)
+    folder = out if out is not None else run
+    if not folder.is_dir():
+        raise ConfigError(f"{folder}: this folder does not exist; make it, or leave --out out to write into {run}")
+    instructions = facet_instructions(alignment, instrument.goniometer_resolution_rad)
+    headline = _headline(alignment, run, instructions)
+    try:
+        png = figure_to_png(draw_instructions(instrument, instructions, picture, headline))
+    except ConfigError as error:
+        raise ConfigError(f"{image if image is not None else run}: {error}") from None
+    n_bolts = max((len(facet.bolt_turn_deg) for facet in alignment.facets), default=0)
+    write_file_durably(folder / CSV_FILE, instructions_to_csv(instructions, n_bolts).encode())
+    write_file_durably(folder / PNG_FILE, png)
+    write_file_durably(folder / PDF_FILE, sheets_to_pdf(instrument, instructions, headline))
+    _report(alignment, instructions, folder)
+
+
+def read_picture(path: Path) -> Image:
+    """A picture file as RGB, shape (rows, columns, 3). Raises ConfigError when it is not one."""
+    try:
+        data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror}); give the picture of the reflector") from None
+    decoded = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
+    if decoded is None:
+        raise ConfigError(f"{path}: is no picture that can be read; give a PNG, JPEG or TIFF file")
+    return np.asarray(cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def _picture_of_run(store: RunStore) -> Image | None:
+    """The run's reflector frames over each other, so that every facet appears lit; None when none were kept."""
+    labels = store.labels()
+    picture: Image | None = None
+    for index, _ in labels[:: max(1, len(labels) // _MOST_FRAMES)]:
+        try:
+            frame = store.frame(index, "reflector")
+        except StoreError:
+            continue  # not kept, or damaged: another frame serves as well
+        if frame.ndim == 2:
+            frame = np.repeat(frame[:, :, np.newaxis], 3, axis=2)
+        if picture is None:
+            picture = frame
+        elif frame.shape == picture.shape:
+            picture = np.maximum(picture, frame)
+    return None if picture is None else np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def _refuse_unknown_facets(alignment: Alignment, instrument: Instrument, run: Path) -> None:
+    unknown = {facet.facet_id for facet in alignment.facets} - set(instrument.reflector.ids)
+    if unknown:
+        raise ConfigError(
+            f"{run}: alignment.json has facets {sorted(unknown)}, which the run's config does not know; "
+            f"run `namod-ctl reconstruct {run}` anew"
+        )
+
+
+def _counts(instructions: tuple[FacetInstruction, ...]) -> str:
+    counted = Counter(instruction.verdict for instruction in instructions)
+    words = {
+        Verdict.TURN: "to turn",
+        Verdict.NO_TURN_NEEDED: "need no turn",
+        Verdict.DO_NOT_TURN: "not to be turned",
+        Verdict.NO_BOLTS: "without bolts",
+    }
+    return ", ".join(f"{counted[verdict]} {text}" for verdict, text in words.items() if counted[verdict])
+
+
+def _headline(alignment: Alignment, run: Path, instructions: tuple[FacetInstruction, ...]) -> str:
+    return (
+        f"{alignment.telescope}, run {run.resolve().name}: {len(instructions)} facets, {_counts(instructions)} "
+        f"(estimator {alignment.estimator}, {alignment.n_used} of {alignment.n_records} records)"
+    )
+
+
+def _report(alignment: Alignment, instructions: tuple[FacetInstruction, ...], folder: Path) -> None:
+    typer.echo(f"{len(instructions)} facets: {_counts(instructions)}.")
+    if instructions and all(instruction.verdict is Verdict.NO_BOLTS for instruction in instructions):
+        typer.echo("This telescope has no bolts: its legs are driven; their travels are in alignment.json.")
+    for instruction in instructions:
+        if instruction.verdict is Verdict.DO_NOT_TURN:
+            typer.echo(f"Facet {instruction.facet_id}: do not turn: {'; '.join(instruction.reasons)}.")
+    if alignment.facets_not_in_run:
+        ids = ", ".join(map(str, alignment.facets_not_in_run))
+        typer.echo(f"Not in this run, so without an instruction: {ids}.")
+    typer.echo(f"Written to {folder}: {CSV_FILE}, {PNG_FILE}, {PDF_FILE}.")

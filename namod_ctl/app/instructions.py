@@ -1,0 +1,95 @@
+"""What a person shall do at each facet, and instructions.csv."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from namod_ctl.core.flags import FACET_FLAG_MEANING
+from namod_ctl.core.units import rad_to_deg
+from namod_ctl.reconstruction.alignment import Alignment, FacetAlignment
+
+CSV_FILE = "instructions.csv"
+NO_TURN_NEEDED = "NO_TURN_NEEDED"  # stands among the flags of instructions.csv
+
+
+class Verdict(StrEnum):
+    """What is to be done at a facet."""
+
+    TURN = "turn"
+    NO_TURN_NEEDED = "no turn needed"
+    DO_NOT_TURN = "do not turn"
+    NO_BOLTS = "no bolts"
+
+
+@dataclass(frozen=True, slots=True)
+class FacetInstruction:
+    """What is to be done at one facet.
+
+    Attributes
+    ----------
+    turns_deg
+        Whole degrees per bolt, positive raises the leg (towards the sky). Empty where nobody should turn, and
+        where there are no bolts. Where no turn is needed it holds the turns too small to be made.
+    flags
+        Names for machines: those of the facet's flags, then NO_TURN_NEEDED where it holds.
+    reasons
+        What the flags mean and what the reconstruction remarked, one line each, for people.
+    """
+
+    facet_id: int
+    verdict: Verdict
+    turns_deg: tuple[int, ...]
+    flags: tuple[str, ...]
+    reasons: tuple[str, ...]
+
+
+def facet_instructions(alignment: Alignment, goniometer_resolution_rad: float) -> tuple[FacetInstruction, ...]:
+    """What is to be done at every facet of the alignment, in its order.
+
+    No turn is needed when every bolt is within half the goniometer's resolution: turning it could not improve it.
+    """
+    smallest_turn_deg = 0.5 * rad_to_deg(goniometer_resolution_rad)
+    return tuple(_instruct(facet, smallest_turn_deg) for facet in alignment.facets)
+
+
+def _instruct(facet: FacetAlignment, smallest_turn_deg: float) -> FacetInstruction:
+    verdict = _verdict(facet, smallest_turn_deg)
+    is_stated = verdict in (Verdict.TURN, Verdict.NO_TURN_NEEDED)
+    flags = facet.flags.names + ((NO_TURN_NEEDED,) if verdict is Verdict.NO_TURN_NEEDED else ())
+    meanings = tuple(meaning for flag, meaning in FACET_FLAG_MEANING.items() if flag in facet.flags)
+    if verdict is Verdict.DO_NOT_TURN and not facet.flags.forbids_turning:
+        meanings += ("no correction could be computed",)
+    turns_deg = tuple(round(float(turn_deg)) for turn_deg in facet.bolt_turn_deg) if is_stated else ()
+    return FacetInstruction(facet.facet_id, verdict, turns_deg, flags, meanings + facet.remarks)
+
+
+def _verdict(facet: FacetAlignment, smallest_turn_deg: float) -> Verdict:
+    if facet.flags.forbids_turning or not np.all(np.isfinite(facet.tilt_correction_rad)):
+        return Verdict.DO_NOT_TURN
+    if len(facet.bolt_turn_deg) == 0:
+        return Verdict.NO_BOLTS
+    if not np.all(np.isfinite(facet.bolt_turn_deg)):
+        return Verdict.DO_NOT_TURN
+    is_small = bool(np.all(np.abs(facet.bolt_turn_deg) <= smallest_turn_deg))
+    return Verdict.NO_TURN_NEEDED if is_small else Verdict.TURN
+
+
+def instructions_to_csv(instructions: Sequence[FacetInstruction], n_bolts: int) -> str:
+    """Text of instructions.csv: facet_id, bolt_1_deg .. bolt_n_deg, flags (separated by `|`).
+
+    Where nobody should turn the numbers are empty. Small turns are given even where no turn is needed.
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["facet_id", *(f"bolt_{bolt + 1}_deg" for bolt in range(n_bolts)), "flags"])
+    for instruction in instructions:
+        turns = [str(turn_deg) for turn_deg in instruction.turns_deg]
+        turns += [""] * (n_bolts - len(turns))
+        writer.writerow([instruction.facet_id, *turns, "|".join(instruction.flags)])
+    return text.getvalue()

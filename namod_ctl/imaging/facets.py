@@ -1,0 +1,184 @@
+"""Facet photometry: the mean intensity of every facet's polygon in a frame of the reflector camera.
+
+A pixel belongs to a polygon when its centre lies inside. The pixels of all facets are collected in one list of
+indices, sorted by facet, once; a frame then costs one gathering, one table and one sum per facet
+(`benchmarks/bench_imaging.py`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from namod_ctl.core.errors import ConfigError
+from namod_ctl.imaging.radiometry import (
+    N_COLOURS,
+    Array,
+    Frame,
+    checked_frame,
+    exposure_factor,
+    response_table,
+    saturation_adu,
+)
+from namod_ctl.optics.camera_model import CameraModel
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FacetLight:
+    """What a frame of the reflector camera says about every facet.
+
+    Attributes
+    ----------
+    intensity
+        Shape (n_facets,). Mean relative intensity of the facet's pixels; 0 for a dark facet.
+    saturated_share
+        Shape (n_facets,). Share of the facet's pixels with a saturated channel, 0 to 1.
+    """
+
+    intensity: Array
+    saturated_share: Array
+
+
+class FacetPhotometer:
+    """The polygons of a reflector as pixels of its camera, ready to measure one frame after another.
+
+    Attributes
+    ----------
+    facet_ids
+        Ids in the order of all results.
+    n_pixels
+        Shape (n_facets,), int: pixels per facet.
+
+    Raises
+    ------
+    ConfigError
+        When a facet has no polygon, or one that has no area, crosses itself or leaves the image.
+    """
+
+    def __init__(self, polygons_px: Mapping[int, Array], facet_ids: Sequence[int], n_columns: int, n_rows: int) -> None:
+        if not facet_ids:
+            raise ConfigError("no facets to measure: give the polygon of at least one facet")
+        missing = [facet_id for facet_id in facet_ids if facet_id not in polygons_px]
+        if missing:
+            raise ConfigError(
+                f"facets {missing} have no polygon in the reflector image: give one to each, or leave these facets out"
+            )
+        pixels = [pixels_of_polygon(polygons_px[i], n_columns, n_rows, f"facet {i}") for i in facet_ids]
+        self.facet_ids = tuple(facet_ids)
+        self.n_pixels = np.array([of_facet.size for of_facet in pixels])
+        self._pixels = np.concatenate(pixels)
+        self._starts = np.concatenate([[0], np.cumsum(self.n_pixels)[:-1]])
+
+    @cached_property
+    def _colour_samples(self) -> NDArray[np.intp]:
+        samples: NDArray[np.intp] = (self._pixels[:, None] * N_COLOURS + np.arange(N_COLOURS)).ravel()
+        return samples
+
+    def measure(self, frame: Frame, camera: CameraModel, exposure_s: float) -> FacetLight:
+        """The facets' light in a frame, shape (rows, columns) or (rows, columns, 3), of the reflector camera.
+
+        Raises
+        ------
+        ConfigError
+            When the frame is not of this camera, or the exposure is no positive number.
+        """
+        frame = checked_frame(frame, camera)
+        factor = exposure_factor(camera.law, exposure_s)
+        n_channels = 1 if frame.ndim == 2 else N_COLOURS
+        response = frame.ravel().take(self._pixels if n_channels == 1 else self._colour_samples)
+        table = response_table(camera, frame.dtype)
+        relative = cv2.LUT(response[None, :], table)[0] if frame.dtype == np.uint8 else table.take(response)
+        total = np.add.reduceat(relative, self._starts * n_channels)
+        return FacetLight(
+            intensity=total / (self.n_pixels * n_channels) * factor,
+            saturated_share=self._saturated_share(response, n_channels, saturation_adu(camera)),
+        )
+
+    def _saturated_share(self, response: Frame, n_channels: int, limit_adu: float) -> Array:
+        # Most frames have no saturated pixel at all, and one maximum is enough to know.
+        if response.max() < limit_adu:
+            return np.zeros(self.n_pixels.size)
+        is_saturated = (response >= limit_adu).reshape(-1, n_channels).any(axis=1)
+        share: Array = np.add.reduceat(is_saturated, self._starts, dtype=np.int64) / self.n_pixels
+        return share
+
+
+def pixels_of_polygon(polygon_px: Array, n_columns: int, n_rows: int, name: str) -> NDArray[np.intp]:
+    """Indices into the raveled image, ascending, of the pixels whose centres lie inside the polygon.
+
+    Parameters
+    ----------
+    polygon_px
+        Shape (n_corners, 2), (x, y). Any simple polygon, convex or not, in either sense; a last corner that repeats
+        the first one is allowed. A pixel centre on the outline belongs to the side with larger x or y.
+    name
+        What the polygon is, for messages.
+
+    Raises
+    ------
+    ConfigError
+        When it has fewer than 3 corners, corners outside the image (its outermost half pixels included), crosses or
+        touches itself, or holds no pixel centre.
+    """
+    corners = np.asarray(polygon_px, dtype=np.float64)
+    if corners.ndim == 2 and corners.shape[0] > 1 and np.array_equal(corners[0], corners[-1]):
+        corners = corners[:-1]
+    if corners.ndim != 2 or corners.shape[1:] != (2,) or corners.shape[0] < 3:
+        raise ConfigError(f"{name}: a polygon of shape {corners.shape}; it needs 3 or more corners (x, y)")
+    is_outside = ~np.all((corners >= -0.5) & (corners <= np.array([n_columns, n_rows]) - 0.5), axis=1)
+    if is_outside.any():
+        x, y = corners[int(np.argmax(is_outside))]
+        raise ConfigError(
+            f"{name}: the corner x = {x:g}, y = {y:g} of its polygon lies outside the image of "
+            f"{n_columns} x {n_rows} pixel: correct the polygon or the size of the image"
+        )
+    crossing = _self_crossing(corners)
+    if crossing is not None:
+        raise ConfigError(
+            f"{name}: its polygon crosses or touches itself (sides {crossing[0] + 1} and {crossing[1] + 1}): "
+            "list its corners in their order around the facet, each once"
+        )
+    left, top = np.ceil(corners.min(axis=0)).astype(int)
+    right, bottom = np.floor(corners.max(axis=0)).astype(int)
+    x, y = np.arange(left, right + 1)[None, :], np.arange(top, bottom + 1)[:, None]
+    is_inside = np.zeros((y.size, x.size), dtype=bool)
+    for (x1, y1), (x2, y2) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        if y1 == y2:
+            continue
+        is_beside = (y < y1) != (y < y2)
+        is_inside ^= is_beside & (x < x1 + (y - y1) * ((x2 - x1) / (y2 - y1)))
+    rows, columns = np.nonzero(is_inside)
+    if rows.size == 0:
+        raise ConfigError(f"{name}: its polygon holds no pixel at all: draw it larger, or leave this facet out")
+    pixels: NDArray[np.intp] = (rows + top) * n_columns + columns + left
+    return pixels
+
+
+def _self_crossing(corners: Array) -> tuple[int, int] | None:
+    """Two sides that have a point in common other than the corner of neighbours, or None."""
+    start, end = corners, np.roll(corners, -1, axis=0)
+    n = len(corners)
+    first, second = np.triu_indices(n, k=1)
+    is_neighbour = (second - first == 1) | (second - first == n - 1)
+    a, b, c, d = start[first], end[first], start[second], end[second]
+    is_common = (_turn(a, b, c) * _turn(a, b, d) <= 0) & (_turn(c, d, a) * _turn(c, d, b) <= 0)
+    overlap = (np.minimum(np.maximum(a, b), np.maximum(c, d)) - np.maximum(np.minimum(a, b), np.minimum(c, d))).min(
+        axis=1
+    )
+    is_crossing = is_common & (overlap >= 0) & ~is_neighbour
+    # Neighbours always share a corner: they cross when one folds back onto the other, or has no length.
+    ahead, back = b - a, d - c
+    is_folded = (ahead[:, 0] * back[:, 1] == ahead[:, 1] * back[:, 0]) & ((ahead * back).sum(axis=1) <= 0)
+    found = np.flatnonzero(is_crossing | (is_neighbour & is_folded))
+    return (int(first[found[0]]), int(second[found[0]])) if found.size else None
+
+
+def _turn(a: Array, b: Array, c: Array) -> Array:
+    """Sign of the turn from a over b to c; 0 on one line."""
+    turn: Array = np.sign((b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0]))
+    return turn

@@ -1,0 +1,95 @@
+"""`namod-ctl config`: what a person reads on a terminal of 80 columns."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from namod_ctl.app import cli
+from namod_ctl.app.config import builtin_folder, builtin_names
+
+
+def _run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
+    """Exit code, standard output and standard error of the command line."""
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setattr("sys.argv", ["namod-ctl", *words])
+    try:
+        cli.main()
+        code = 0
+    except SystemExit as stop:
+        code = int(stop.code or 0)
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def test_fact_is_explained(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = _run(monkeypatch, capsys, "config", "check", "fact")
+    assert code == 0
+    assert max(map(len, out.splitlines())) <= 80
+    text = " ".join(out.split())
+    for expected in (
+        "Telescope FACT",
+        "4.889 m",
+        "30, hexagon 0.606 m flat to flat",
+        "0, 2 to 7, 10 to 13, 15 to 19, 21 to 27, 29 to 35",
+        "3180.4 cm2",
+        "4.876 to 4.902 m",
+        "tripod, 3 legs 120 deg apart at 0.295 m, leg 1 at +x",
+        "1 mm per turn",
+        "62.54 x 46.90 deg",
+        "+x to the right, +y up (not mirrored)",
+        "log10 I = 1.03 log10 C -1.15 log10 (T/s) -0.19",
+        "not calibrated",
+        "30 of 30 facets",
+        "fact: valid",
+    ):
+        assert expected in text, expected
+
+
+@pytest.mark.parametrize("name", builtin_names())
+def test_every_builtin_config_fits_the_terminal(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, out, _ = _run(monkeypatch, capsys, "config", "check", name)
+    assert code == 0
+    assert max(map(len, out.splitlines())) <= 80
+    assert f"{name}: valid" in out
+
+
+def test_a_turned_and_mirrored_camera_is_told_in_words(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (builtin_folder() / "mini_fact.toml").read_text()
+    text = text.replace("rotation_deg = 0.0\nmirrored = false", "rotation_deg = 0.0\nmirrored = true", 1)
+    head, _, tail = text.partition("[reflector_camera]")
+    path = tmp_path / "it.toml"
+    path.write_text(head + "[reflector_camera]" + tail.replace("rotation_deg = 0.0", "rotation_deg = 90.0"))
+    _, out, _ = _run(monkeypatch, capsys, "config", "check", str(path))
+    text = " ".join(out.split())
+    assert "+x to the left, +y up (mirrored)" in text
+    # Turned counter-clockwise by 90 deg: what is right in the image is telescope up, so +y is to the right.
+    assert "+x down, +y to the right (not mirrored)" in text
+    assert "warning: no map of facets" in text
+
+
+def test_all_builtin_configs_are_listed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = _run(monkeypatch, capsys, "config", "list")
+    assert code == 0
+    rows = [line.split() for line in out.splitlines()[1:]]
+    assert [row[0] for row in rows] == builtin_names()
+    assert ["mst_like", "MST-like", "86", "16", "m"] in rows
+
+
+@pytest.mark.parametrize("content", [None, "[telescope", "[telescope]\nfocal_length_mm = 4889\n", "\x00"])
+def test_a_bad_config_is_a_message_and_exit_code_2(
+    content: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "bad.toml"
+    if content is not None:
+        path.write_text(content)
+    code, out, err = _run(monkeypatch, capsys, "config", "check", str(path))
+    assert code == 2
+    assert out == ""
+    assert "bad.toml" in err
+    assert "Traceback" not in err
