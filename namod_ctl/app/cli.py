@@ -11,6 +11,7 @@ from namod_ctl.app.commands import config, imports
 from namod_ctl.app.commands.export import export
 from namod_ctl.app.commands.instruct import instruct
 from namod_ctl.app.commands.raytrace import raytrace
+from namod_ctl.app.commands.reconstruct import reconstruct_run
 from namod_ctl.core.errors import NamodError
 
 app = typer.Typer(
@@ -36,6 +37,7 @@ def _root(
 
 
 app.command("raytrace")(raytrace)
+app.command("reconstruct")(reconstruct_run)
 app.command("instruct")(instruct)
 app.command("export")(export)
 

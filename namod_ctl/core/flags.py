@@ -20,6 +20,7 @@ class FacetFlag(Flag):
     FEW_RECORDS = auto()
     LARGE_UNCERTAINTY = auto()
     BEYOND_TRAVEL_LIMIT = auto()
+    RESTS_ON_BAD_RECORD = auto()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -42,6 +43,7 @@ FACET_FLAG_MEANING: dict[FacetFlag, str] = {
     FacetFlag.FEW_RECORDS: "too few records hit the facet's point spread function",
     FacetFlag.LARGE_UNCERTAINTY: "the estimate's uncertainty is too large to correct on",
     FacetFlag.BEYOND_TRAVEL_LIMIT: "the correction would move a leg beyond its limit: refused",
+    FacetFlag.RESTS_ON_BAD_RECORD: "the estimate rests on a record that disagrees with all others",
 }
 
 

@@ -9,42 +9,43 @@ uncertainty, taken from the noise that is really in the pixels, still true.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from functools import lru_cache
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
 from namod_ctl.imaging.dark import HOT_SIGMAS, NEIGHBOURS, QUANTISATION_NOISE_ADU, isolated_pixels, repair_pixels
 from namod_ctl.imaging.radiometry import Frame
+from namod_ctl.imaging.star_sky import (
+    CLIP_SIGMAS,
+    CLIPPED_SHARE_OF_SPREAD,
+    RING_WIDTH,
+    axes,
+    distance2,
+    plane_through,
+    ring_around,
+    sky_in,
+)
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 FWHM_PER_SIGMA = float((8.0 * np.log(2.0)) ** 0.5)
-RING_WIDTH = 0.5
-"""The background is taken from a ring around the aperture, this share of the aperture's radius wide."""
+NEAR = 1.25
+"""Of the aperture's radius: how far around the star it is looked at closely."""
 
 MOMENT_STEPS = 25
 MOMENT_TOLERANCE = 0.01
 """Of the window's size: a window that is 1 % off costs 1e-4 of the centre's precision."""
 
 MIN_SIGMA_PX = 0.5
+WIDTHS = np.array([0.5**0.5, 1.0, 2.0])
+"""Of the gaussians whose sum stands for the star, in units of the matched one: core and wings of real optics."""
+
 CENTRE_STEPS = 8
 CENTRE_TOLERANCE_PX = 1e-4
-CLIP_STEPS = 3
-CLIP_SIGMAS = 3.0
-CLIPPED_SHARE_OF_SPREAD = 0.9866
-"""Standard deviation of a normal distribution cut at 3 sigma."""
-
-MAX_DARK_SHARE = 0.05
-"""With more pixels of the sky at 0 than this, the camera's offset is too low to show the noise whole."""
-
-RARE_SHARE = 0.005
-"""The largest values of the sky that are not used to tell its noise: they may be stars."""
-
 BRIGHT_SHARE = 0.15
 """Pixels with more than this share of the star's peak are looked at for the noise of its light."""
 
@@ -112,7 +113,6 @@ class Profile:
 class _Fit:
     """A gaussian matched to a cut-out: x, y in its pixels, covariance in pixel**2, and the noise around it."""
 
-    sky: Mask
     signal: Array
     x: float
     y: float
@@ -143,26 +143,32 @@ def measure_profile(
     table
         `radiometry.response_table` of the camera.
     """
-    half = int(np.ceil((1.0 + RING_WIDTH) * aperture_px))
-    left, top = max(0, round(x_px) - half), max(0, round(y_px) - half)
-    cut = frame[top : round(y_px) + half + 1, left : round(x_px) + half + 1]
-    x, y = x_px - left, y_px - top
-    ring = _ring(cut.shape, x, y, aperture_px)
+    cut, left, top = _cut_out(frame, x_px, y_px, (1.0 + RING_WIDTH) * aperture_px)
+    ring = ring_around(cut.shape, x_px - left, y_px - top, aperture_px)
     level_adu = float(np.median(cut[ring]))
     spread_adu = max(1.4826 * float(np.median(np.abs(cut[ring] - level_adu))), QUANTISATION_NOISE_ADU)
     is_hot = isolated_pixels(cut, level_adu, spread_adu)
     if is_hot.any():
         cut = repair_pixels(cut, is_hot)
-    fit = _fit(cut, ring, x, y, diameter_px)
+    sky, plane, noise_adu = sky_in(cut, ring)
+    intensity = table.take(cut)
+    intensity -= plane_through(intensity, sky)
+    # The sky is known: from here on only the star itself and what is close to it matter.
+    cut, near_left, near_top = _cut_out(cut, x_px - left, y_px - top, NEAR * aperture_px)
+    rows = slice(near_top, near_top + cut.shape[0])
+    columns = slice(near_left, near_left + cut.shape[1])
+    plane, intensity = plane[rows, columns], intensity[rows, columns]
+    left, top = left + near_left, top + near_top
+    fit = _fit(cut - plane, noise_adu, x_px - left, y_px - top, diameter_px)
     is_hot = _standing_out(fit)
     if is_hot.any():
         cut = repair_pixels(cut, is_hot)
-        fit = _fit(cut, ring, fit.x, fit.y, diameter_px)
+        intensity = np.where(is_hot, table.take(cut) - table.take(np.rint(plane).astype(cut.dtype)), intensity)
+        fit = _fit(cut - plane, noise_adu, fit.x, fit.y, diameter_px)
     x, y, uncertainty_px = _balanced_centre(fit)
     minor, major = np.linalg.eigvalsh(fit.covariance)
     sigma_px = float((major * minor) ** 0.25)
-    aperture = _distance2(cut.shape, x, y) <= aperture_px**2
-    intensity = table.take(cut)
+    aperture = distance2(cut.shape, x, y) <= aperture_px**2
     return Profile(
         x_px=x + left,
         y_px=y + top,
@@ -170,86 +176,30 @@ def measure_profile(
         diameter_px=FWHM_PER_SIGMA * sigma_px,
         elongation=float((major / minor) ** 0.5),
         peak_adu=fit.height_adu,
-        noise_adu=fit.noise_adu,
-        intensity_sum=float((intensity - _plane(intensity, fit.sky))[aperture].sum()),
+        noise_adu=noise_adu,
+        intensity_sum=float(intensity[aperture].sum()),
         brightest_adu=float(cut[aperture].max(initial=0)),
         companion_share=_companion_share(fit, sigma_px),
         aperture_px=aperture_px,
     )
 
 
-@lru_cache(maxsize=32)
-def _axes(shape: tuple[int, ...]) -> tuple[Array, Array]:
-    """Row and column numbers of a cut-out, shapes (rows, 1) and (1, columns)."""
-    return np.arange(shape[0], dtype=np.float64)[:, None], np.arange(shape[1], dtype=np.float64)[None, :]
+def _cut_out(frame: Frame, x: float, y: float, reach_px: float) -> tuple[Frame, int, int]:
+    """The square around (x, y) as far as it lies in the frame, and its first column and row there."""
+    half = math.ceil(reach_px)
+    left, top = max(0, round(x) - half), max(0, round(y) - half)
+    return frame[top : round(y) + half + 1, left : round(x) + half + 1], left, top
 
 
-def _distance2(shape: tuple[int, ...], x: float, y: float) -> Array:
-    rows, columns = _axes(shape)
-    distance2: Array = (columns - x) ** 2 + (rows - y) ** 2
-    return distance2
-
-
-def _ring(shape: tuple[int, ...], x: float, y: float, aperture_px: float) -> Mask:
-    distance2 = _distance2(shape, x, y)
-    ring: Mask = (distance2 > aperture_px**2) & (distance2 <= ((1.0 + RING_WIDTH) * aperture_px) ** 2)
-    return ring
-
-
-def _sky(cut: Frame, ring: Mask) -> tuple[Mask, Array, float]:
-    """Pixels of the ring that show the sky, the plane through them (shape of `cut`), and their noise around it.
-
-    Pixels more than 3 sigma off the plane (other stars, hot pixels) are left out.
-    """
-    values = cut[ring]
-    middle = float(np.median(values))
-    is_cut = np.count_nonzero(values == 0) > MAX_DARK_SHARE * values.size
-    least_adu = max(_noise_cut_at_zero(values) if is_cut else 0.0, QUANTISATION_NOISE_ADU)
-    noise_adu = max(1.4826 * float(np.median(np.abs(values - middle))), least_adu)
-    residual = cut - middle
-    for _ in range(CLIP_STEPS):
-        # A whole step of rounding always belongs to the sky, however dark and quiet it is.
-        sky = ring & (np.abs(residual) <= max(CLIP_SIGMAS * noise_adu, 1.0))
-        plane = _plane(cut, sky)
-        residual = cut - plane
-        noise_adu = max(float(np.std(residual[sky])) / CLIPPED_SHARE_OF_SPREAD, least_adu)
-    return sky, plane, noise_adu
-
-
-def _noise_cut_at_zero(values: Frame) -> float:
-    """Standard deviation of a normal distribution that was rounded, and whose negative values were made 0.
-
-    From how many values are 0, and how many are at most some larger one. 0 when too few are above 0 to tell.
-    """
-    share_up_to = np.cumsum(np.bincount(values)) / values.size
-    upper = int(np.searchsorted(share_up_to, 1.0 - RARE_SHARE)) - 1
-    if upper < 1:
-        return 0.0
-    return float(upper / (ndtri(share_up_to[upper]) - ndtri(share_up_to[0])))
-
-
-def _plane(values: NDArray[np.number], sky: Mask) -> Array:
-    """The plane of least squares through the values at `sky`; shape of `values`."""
-    # Coordinates from -1 to 1 keep the three by three system well conditioned.
-    down, right = (axis / (size / 2.0) - 1.0 for axis, size in zip(_axes(values.shape), values.shape, strict=True))
-    rows, columns = np.nonzero(sky)
-    basis = np.stack([np.ones(rows.size), down[rows, 0], right[0, columns]])
-    level, slope_down, slope_right = np.linalg.lstsq(basis @ basis.T, basis @ values[sky], rcond=None)[0]
-    plane: Array = level + slope_down * down + slope_right * right
-    return plane
-
-
-def _fit(cut: Frame, ring: Mask, x: float, y: float, diameter_px: float) -> _Fit:
-    """The gaussian that matches the light of `cut` above the background seen in `ring`."""
-    sky, plane, noise_adu = _sky(cut, ring)
-    signal = cut - plane
+def _fit(signal: Array, noise_adu: float, x: float, y: float, diameter_px: float) -> _Fit:
+    """The gaussian that matches the light of `signal`, a cut-out less its sky."""
     x, y, covariance = _matched_moments(signal, x, y, diameter_px / FWHM_PER_SIGMA)
     shape = _gaussian(signal.shape, x, y, covariance)
     height_adu = float((shape * signal).sum() / (shape * shape).sum())
     rough = cv2.filter2D(signal - height_adu * shape, cv2.CV_64F, _ROUGHNESS)
     light = np.maximum(cv2.blur(signal, (3, 3)), 0.0)
     shot_adu = _shot_adu(np.asarray(rough, dtype=np.float64), light, noise_adu)
-    return _Fit(sky, signal, x, y, covariance, max(height_adu, 0.0), shape, noise_adu, shot_adu, light)
+    return _Fit(signal, x, y, covariance, max(height_adu, 0.0), shape, noise_adu, shot_adu, light)
 
 
 def _shot_adu(rough: Array, light: Array, noise_adu: float) -> float:
@@ -276,7 +226,7 @@ def _shot_adu(rough: Array, light: Array, noise_adu: float) -> float:
 
 def _gaussian(shape: tuple[int, ...], x: float, y: float, covariance: Array) -> Array:
     """exp(-d^T C^-1 d / 2) of every pixel's distance d from (x, y)."""
-    rows, columns = _axes(shape)
+    rows, columns = axes(shape)
     dx, dy = columns - x, rows - y
     xx, xy, yy = _inverse(covariance)
     gaussian: Array = np.exp((-0.5 * xx * dx**2) + (-0.5 * yy * dy**2) - (xy * dx) * dy)
@@ -292,7 +242,7 @@ def _inverse(covariance: Array) -> tuple[float, float, float]:
 def _matched_moments(signal: Array, x: float, y: float, sigma_px: float) -> tuple[float, float, Array]:
     """Centre and covariance of the gaussian window that equals the moments seen through it (adaptive moments)."""
     covariance = np.eye(2) * max(sigma_px, MIN_SIGMA_PX) ** 2
-    rows, columns = _axes(signal.shape)
+    rows, columns = axes(signal.shape)
     max_variance = (max(signal.shape) / 4.0) ** 2
     for _ in range(MOMENT_STEPS):
         weighted = _gaussian(signal.shape, x, y, covariance) * signal
@@ -337,31 +287,49 @@ def _standing_out(fit: _Fit) -> Mask:
 
 
 def _balanced_centre(fit: _Fit) -> tuple[float, float, float]:
-    """Centre (x, y) at which the data balance, and one standard deviation of each axis."""
+    """Centre (x, y) at which the data balance, and one standard deviation of each axis.
+
+    The balance is d(ln likelihood)/d(centre) = 0 for normal noise of each pixel's own variance and a star that is a sum
+    of gaussians of one centre, `WIDTHS` times as wide as the matched one.
+    """
     xx, xy, yy = _inverse(fit.covariance)
     inverse = np.array([[xx, xy], [xy, yy]])
-    rows, columns = _axes(fit.signal.shape)
-    background = fit.noise_adu**2
+    rows, columns = axes(fit.signal.shape)
+    heights = _heights(fit)
     x, y = fit.x, fit.y
     for _ in range(CENTRE_STEPS):
-        shape = _gaussian(fit.signal.shape, x, y, fit.covariance)
-        variance = background + fit.shot_adu * fit.height_adu * shape
-        weight = shape / variance
+        parts = _parts(_gaussian(fit.signal.shape, x, y, fit.covariance))
+        # The star, and what times (inverse covariance) (distance) is its slope, and the slope of that.
+        star, slope, bend = (np.tensordot(heights / WIDTHS**power, parts, axes=1) for power in (0, 2, 4))
+        variance = fit.noise_adu**2 + fit.shot_adu * np.maximum(star, 0.0)
+        weight = slope / variance
         dx, dy = columns[0] - x, rows[:, 0] - y
         weighted = weight * fit.signal
         imbalance = np.array([weighted.sum(axis=0) @ dx, weighted.sum(axis=1) @ dy])
-        slope = weighted.sum() * np.eye(2) - _moments(weighted * background / variance, dx, dy) @ inverse
-        if np.linalg.det(slope) <= 0.0:
-            break
-        step = np.clip(np.linalg.solve(slope, imbalance), -1.0, 1.0)
+        turned = (bend - fit.shot_adu * slope * weight) / variance * fit.signal
+        response = weighted.sum() * np.eye(2) - _moments(turned, dx, dy) @ inverse
+        if np.linalg.det(response) <= 0.0:
+            return fit.x, fit.y, float("inf")
+        step = np.clip(np.linalg.solve(response, imbalance), -1.0, 1.0)
         x, y = x + float(step[0]), y + float(step[1])
         if np.abs(step).max() < CENTRE_TOLERANCE_PX:
             break
-    if np.linalg.det(slope) <= 0.0:
-        return fit.x, fit.y, float("inf")
-    gain = np.linalg.inv(slope)
+    gain = np.linalg.inv(response)
     covariance = gain @ _moments(weight * weight * fit.variance, dx, dy) @ gain.T
     return x, y, float((np.trace(covariance) / 2.0) ** 0.5)
+
+
+def _parts(shape: Array) -> Array:
+    """Gaussians `WIDTHS` times as wide as `shape`, stacked: powers of it."""
+    wide = np.sqrt(np.sqrt(shape))
+    return np.stack([shape * shape, shape, wide])
+
+
+def _heights(fit: _Fit) -> Array:
+    """Heights of the gaussians of `_parts` that together come closest to the star, least squares over the variance."""
+    parts = _parts(fit.shape).reshape(WIDTHS.size, -1)
+    weighted = parts / fit.variance.ravel()
+    return np.asarray(np.linalg.lstsq(weighted @ parts.T, weighted @ fit.signal.ravel(), rcond=None)[0], np.float64)
 
 
 def _moments(weight: Array, dx: Array, dy: Array) -> Array:

@@ -1,0 +1,96 @@
+"""Flags of a facet's estimate, each with the figures behind it in words."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import Delaunay, QhullError
+
+from namod_ctl.core.flags import FacetFlag
+from namod_ctl.core.units import rad_to_arcmin
+from namod_ctl.reconstruction.facet_fit import FacetFit
+from namod_ctl.reconstruction.facet_psf import BACKGROUND, CENTRE, covariance_of_light
+
+Array = NDArray[np.float64]
+
+_LIT_SHARE = 0.1  # a record counts as in the PSF from this share of the facet's scale on
+_MIN_LIT = 2  # one lit record is a direction, not a centre
+_MIN_CONTRAST = 3.0  # lit responses over the 95 % level of the dark ones; pure noise reaches 2
+_MIN_DARK = 20  # dark records needed to know their level
+_MAX_SIGMA_SIZES = 2.0  # beyond twice the PSF's own width a correction scatters the light more than it gathers
+_CUT_SIGMA, _CUT_SHARE = 2.0, 0.1  # a PSF is cut when more than this share of its 2 sigma ellipse was never visited
+_N_ELLIPSE = 48
+
+
+class ScanRegion:
+    """The convex hull of the recorded directions."""
+
+    def __init__(self, theta_rad: Array) -> None:
+        try:
+            self._hull: Delaunay | None = Delaunay(theta_rad)
+        except (QhullError, ValueError):  # too few directions, or all on one line: nothing is inside
+            self._hull = None
+
+    def contains(self, theta_rad: Array) -> NDArray[np.bool_]:
+        """For directions of shape (n, 2): which lie within the scan."""
+        if self._hull is None:
+            return np.zeros(len(theta_rad), dtype=np.bool_)
+        inside: NDArray[np.bool_] = self._hull.find_simplex(theta_rad) >= 0
+        return inside
+
+
+def n_lit_records(fit: FacetFit, response: Array) -> int:
+    """Number of records in the facet's window in which it was lit."""
+    lit = response[fit.used] / fit.scale - max(fit.parameters[BACKGROUND], 0.0) > _LIT_SHARE
+    return int(np.count_nonzero(lit))
+
+
+def has_signal(fit: FacetFit, response: Array) -> bool:
+    """True when the facet's window is brighter than its dark records ever are (`response` (n,), NaN ignored)."""
+    is_dark = np.ones(len(response), dtype=np.bool_)
+    is_dark[fit.used] = False
+    dark = response[is_dark & np.isfinite(response)]
+    if len(dark) < _MIN_DARK:
+        return True
+    level = float(np.median(dark))
+    scatter = float(np.quantile(np.abs(dark - level), 0.95))
+    bright = np.sort(response[fit.used])[-_MIN_LIT:]
+    return bool(bright[0] - level > _MIN_CONTRAST * scatter)
+
+
+def judge_fit(
+    fit: FacetFit, response: Array, centre_cov_rad2: Array, region: ScanRegion, typical_size_rad: float
+) -> tuple[FacetFlag, tuple[str, ...]]:
+    """Flags of a facet's robust estimate and the remarks that explain them."""
+    if not has_signal(fit, response):
+        return FacetFlag.NO_SIGNAL, ("no response rises above the facet's background",)
+    flags, remarks = FacetFlag.NONE, []
+    centre = fit.parameters[CENTRE]
+    if not region.contains(centre[None])[0]:
+        flags |= FacetFlag.PSF_OUTSIDE_SCAN | FacetFlag.UNRELIABLE
+        remarks.append("its centre lies outside the recorded directions: steer the telescope further out there")
+    elif (cut := _cut_share(fit, region)) > _CUT_SHARE:
+        flags |= FacetFlag.PSF_CUT_BY_SCAN_EDGE
+        remarks.append(f"{100.0 * cut:.0f} % of its outline lies beyond the recorded directions")
+    n_lit = n_lit_records(fit, response)
+    if n_lit < _MIN_LIT:
+        flags |= FacetFlag.FEW_RECORDS | FacetFlag.UNRELIABLE
+        remarks.append(f"lit in {n_lit} records only, {_MIN_LIT} are needed: record longer around its centre")
+    sigma = math.sqrt(float(np.linalg.eigvalsh(centre_cov_rad2)[-1]))
+    limit = _MAX_SIGMA_SIZES * typical_size_rad
+    if sigma > limit:
+        flags |= FacetFlag.LARGE_UNCERTAINTY | FacetFlag.UNRELIABLE
+        remarks.append(
+            f"uncertain by {rad_to_arcmin(sigma):.1f} arcmin, the limit is {rad_to_arcmin(limit):.1f} arcmin"
+        )
+    return flags, tuple(remarks)
+
+
+def _cut_share(fit: FacetFit, region: ScanRegion) -> float:
+    """Share of the outline of the point spread function, at 2 sigma, that lies beyond the scan."""
+    angle = np.linspace(0.0, 2.0 * np.pi, _N_ELLIPSE, endpoint=False)
+    circle = _CUT_SIGMA * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    outline = fit.parameters[CENTRE] + circle @ np.linalg.cholesky(covariance_of_light(fit.parameters)).T
+    return float(1.0 - np.mean(region.contains(outline)))
