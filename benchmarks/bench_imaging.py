@@ -5,12 +5,12 @@ cv2.minMaxLoc pass over both frames, which is the least that looking at every pi
 
     python benchmarks/bench_imaging.py [--repetitions 25]
 """
+# ruff: noqa: E402 - the number of threads is set before the libraries are loaded, which read it then
 
 from __future__ import annotations
 
 import os
 
-# Before the libraries are loaded: they read the number of threads then.
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_variable] = "1"
 
@@ -35,21 +35,23 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "unit" / "imaging")
 from frames import OFFSET_ADU, SIGMA_PX, exposed, gaussian_light
 from imaging_instruments import hexagons, instrument
 
+from namod_ctl.core.records import Record
 from namod_ctl.imaging.facets import FacetPhotometer, pixels_of_polygon
 from namod_ctl.imaging.measure import measure_record
+from namod_ctl.imaging.star import Star, star_finder
 
 Frame = NDArray[np.uint8]
 STAR_SHAPE, REFLECTOR_SHAPE = (1920, 2560), (768, 1024)
-N_ACCURACY = 60
+N_ACCURACY, ACCURACY_SHAPE, PEAKS_ADU = 400, (400, 480), (20.0, 230.0)
 
 
 def star_frames(n: int, rng: np.random.Generator) -> list[tuple[Frame, NDArray[np.float64]]]:
-    """Frames with one star each at a random place and of random brightness, and the true places."""
+    """Smaller frames with one star each at a random place and of random brightness, and the true places."""
     frames = []
     for _ in range(n):
-        true = rng.uniform(100.0, np.array(STAR_SHAPE[::-1]) - 100.0)
-        height = float(10.0 ** rng.uniform(np.log10(30.0), np.log10(215.0)))
-        frames.append((exposed(height * gaussian_light(STAR_SHAPE, *true, SIGMA_PX), rng).astype(np.uint8), true))
+        true = rng.uniform(100.0, np.array(ACCURACY_SHAPE[::-1]) - 100.0)
+        light = rng.uniform(*PEAKS_ADU) * gaussian_light(ACCURACY_SHAPE, *true, SIGMA_PX)
+        frames.append((exposed(light, rng).astype(np.uint8), true))
     return frames
 
 
@@ -110,9 +112,10 @@ def main() -> None:
     labels, numbers = peer_labels(), list(hexagons())
     star = exposed(200.0 * gaussian_light(STAR_SHAPE, 1200.3, 800.7, SIGMA_PX), rng).astype(np.uint8)
 
-    def ours(frame: Frame = star) -> NDArray[np.float64]:
-        record = measure_record(frame, reflector, 0.1, 0.5, telescope, photometer, 0, "")
-        return telescope.star_camera.pixel_of_theta(record.theta_rad)
+    finder = star_finder(telescope.star_camera, telescope.star_size_rad, star.dtype)
+
+    def ours() -> Record:
+        return measure_record(star, reflector, 0.1, 0.5, telescope, photometer, 0, "")
 
     def peer_facets() -> None:
         # Its one image of labels wants one image of values: the mean over the colours.
@@ -128,6 +131,7 @@ def main() -> None:
 
     jobs: dict[str, Callable[[], object]] = {
         "namod-ctl: measure_record": ours,
+        "    of that: star": lambda: finder.find(star),
         "    of that: facets": lambda: photometer.measure(reflector, telescope.reflector_camera, 0.5),
         "sep + scipy.ndimage.mean": peer,
         "    of that: sep": lambda: peer_centre(star),
@@ -155,17 +159,22 @@ def main() -> None:
     console.print(table)
 
     frames = star_frames(N_ACCURACY, rng)
+    stars = [finder.find(frame) for frame, _ in frames]
     errors = {
-        "namod-ctl": np.array([ours(frame) - true for frame, true in frames]),
+        "namod-ctl": np.array(
+            [(s.x_px, s.y_px) - t for s, (_, t) in zip(stars, frames, strict=True) if isinstance(s, Star)]
+        ),
         "sep winpos": np.array([peer_centre(frame) - true for frame, true in frames]),
     }
     accuracy = Table(
-        title=f"Centres of {N_ACCURACY} stars, peaks of 30 to 215 of 255, at random places between pixels",
+        title=f"Centres of {N_ACCURACY} stars, peaks {PEAKS_ADU[0]:.0f} to {PEAKS_ADU[1]:.0f} of 255, at random places"
     )
-    for heading in ("", "rms error / px", "largest / px"):
+    for heading in ("", "stars", "rms error / px", "median error / px", "largest / px"):
         accuracy.add_column(heading, justify="left" if heading == "" else "right")
     for name, error in errors.items():
-        accuracy.add_row(name, f"{np.sqrt(np.mean(error**2)):.5f}", f"{np.abs(error).max():.4f}")
+        distance = np.hypot(*error.T)
+        rms = np.sqrt(np.mean(error**2))
+        accuracy.add_row(name, str(len(error)), f"{rms:.5f}", f"{np.median(distance):.5f}", f"{distance.max():.4f}")
     console.print(accuracy)
 
 

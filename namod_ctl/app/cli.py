@@ -1,20 +1,50 @@
-"""The command line: one thin function per command, and the one place where errors become messages."""
+"""The command line: where commands are found, and the one place where errors become messages."""
 
 from __future__ import annotations
 
 import sys
+from importlib import import_module
+from typing import Any
 
 import typer
+from typer.core import TyperGroup
 
 from namod_ctl import __version__
-from namod_ctl.app.commands import config, imports
-from namod_ctl.app.commands.export import export
-from namod_ctl.app.commands.instruct import instruct
-from namod_ctl.app.commands.raytrace import raytrace
-from namod_ctl.app.commands.reconstruct import reconstruct_run
 from namod_ctl.core.errors import NamodError
 
+# A command's module is imported when the command is called, so that none waits for the libraries of another.
+_COMMANDS = {
+    "config": "namod_ctl.app.commands.config:app",
+    "import": "namod_ctl.app.commands.imports:app",
+    "reconstruct": "namod_ctl.app.commands.reconstruct:reconstruct_run",
+    "instruct": "namod_ctl.app.commands.instruct:instruct",
+    "export": "namod_ctl.app.commands.export:export",
+    "raytrace": "namod_ctl.app.commands.raytrace:raytrace",
+}
+
+
+class _Commands(TyperGroup):
+    """The commands in the order in which a night needs them, imported on demand."""
+
+    # typer brings its own copy of click or the real one, depending on its version: hence Any
+    def list_commands(self, ctx: Any) -> list[str]:
+        return list(_COMMANDS)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        if cmd_name not in _COMMANDS:
+            return None
+        module, name = _COMMANDS[cmd_name].split(":")
+        target = getattr(import_module(module), name)
+        if not isinstance(target, typer.Typer):
+            function, target = target, typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+            target.command(cmd_name)(function)
+        command = typer.main.get_command(target)
+        command.name = cmd_name
+        return command
+
+
 app = typer.Typer(
+    cls=_Commands,
     help="Align the segmented mirror of a Cherenkov telescope with two cameras, by the NAMOD method.",
     no_args_is_help=True,
     add_completion=True,
@@ -34,16 +64,6 @@ def _root(
     version: bool = typer.Option(False, "--version", callback=_print_version, is_eager=True, help="Print the version."),
 ) -> None:
     pass
-
-
-app.command("raytrace")(raytrace)
-app.command("reconstruct")(reconstruct_run)
-app.command("instruct")(instruct)
-app.command("export")(export)
-
-
-app.add_typer(imports.app, name="import")
-app.add_typer(config.app, name="config")
 
 
 def main() -> None:

@@ -28,7 +28,6 @@ from namod_ctl.imaging.radiometry import (
 )
 from namod_ctl.optics.camera_model import CameraModel
 
-
 MAX_GROUP_PIXELS = 20_000
 """Pixels, of three colours, whose table entries fill half a megabyte."""
 

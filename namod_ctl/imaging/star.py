@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.flags import RejectReason
 from namod_ctl.imaging.radiometry import Frame, response_table, saturation_adu
 from namod_ctl.imaging.star_candidates import MAX_SPOT_SHARE, FirstLook, Spot, first_look
@@ -49,6 +50,9 @@ APERTURE_RADIUS_OF_BROAD_STAR = 1.5
 
 SMALLEST_APERTURE_PX = 6.0
 """Radius: a smaller one leaves too few pixels around it for the background."""
+
+SMALLEST_FRAME = 4.0
+"""Of the aperture's radius: width or height of a frame with room for an aperture and some sky."""
 
 STREAK_ELONGATION = 3.0
 STREAK_LENGTH = 4.0
@@ -113,7 +117,18 @@ class StarFinder:
     table: NDArray[np.float64]
 
     def find(self, frame: Frame) -> Star | StarRejection:
-        """The star of a frame (rows, columns), or why there is none that counts."""
+        """The star of a frame (rows, columns), or why there is none that counts.
+
+        Raises
+        ------
+        ConfigError
+            When the frame is too small for stars of this size.
+        """
+        if min(frame.shape) < SMALLEST_FRAME * self._aperture_px(0.0):
+            raise ConfigError(
+                f"a star frame of {frame.shape[1]} x {frame.shape[0]} pixel is too small for stars of "
+                f"{self.star_size_px:.1f} pixel: correct star_size, the plate scale or the size of the image"
+            )
         look = first_look(frame, self.star_size_px, self.full_scale_adu, fainter_share=0.5 * DOMINANCE_SHARE)
         if look.sky_adu >= self.saturation_adu:
             return StarRejection(
@@ -176,10 +191,9 @@ class StarFinder:
                     RejectReason.STAR_SATURATED, f"saturated light {where}, {spot.diameter_px:.0f} pixel wide"
                 )
             return self._too_large(where, spot.diameter_px)
-        aperture_px = max(
-            APERTURE_RADIUS * self.star_size_px, APERTURE_RADIUS_OF_BROAD_STAR * spot.diameter_px, SMALLEST_APERTURE_PX
+        profile = measure_profile(
+            frame, spot.x_px, spot.y_px, spot.diameter_px, self._aperture_px(spot.diameter_px), self.table
         )
-        profile = measure_profile(frame, spot.x_px, spot.y_px, spot.diameter_px, aperture_px, self.table)
         if profile.peak_adu < MIN_SIGMAS * profile.noise_adu:
             return StarRejection(
                 RejectReason.NO_STAR,
@@ -193,6 +207,11 @@ class StarFinder:
                 f"the spot {where} is {profile.diameter_px:.1f} pixel wide (limit {smallest_px:.1f})",
             )
         return profile
+
+    def _aperture_px(self, diameter_px: float) -> float:
+        """Radius of the aperture for a star that looks `diameter_px` wide."""
+        of_size, of_broad = APERTURE_RADIUS * self.star_size_px, APERTURE_RADIUS_OF_BROAD_STAR * diameter_px
+        return max(of_size, of_broad, SMALLEST_APERTURE_PX)
 
     def _reason_against(self, frame: Frame, star: Profile) -> StarRejection | None:
         """What stands against the dominant star of a frame."""

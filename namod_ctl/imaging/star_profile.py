@@ -24,6 +24,7 @@ from namod_ctl.imaging.star_sky import (
     RING_WIDTH,
     axes,
     distance2,
+    level_and_spread,
     plane_through,
     ring_around,
     sky_in,
@@ -45,7 +46,8 @@ WIDTHS = np.array([0.5**0.5, 1.0, 2.0])
 """Of the gaussians whose sum stands for the star, in units of the matched one: core and wings of real optics."""
 
 CENTRE_STEPS = 8
-CENTRE_TOLERANCE_PX = 1e-4
+CENTRE_TOLERANCE_PX = 2e-3
+"""Of the last step: the steps are Newton's, and the next one would be a thousand times smaller."""
 BRIGHT_SHARE = 0.15
 """Pixels with more than this share of the star's peak are looked at for the noise of its light."""
 
@@ -145,12 +147,11 @@ def measure_profile(
     """
     cut, left, top = _cut_out(frame, x_px, y_px, (1.0 + RING_WIDTH) * aperture_px)
     ring = ring_around(cut.shape, x_px - left, y_px - top, aperture_px)
-    level_adu = float(np.median(cut[ring]))
-    spread_adu = max(1.4826 * float(np.median(np.abs(cut[ring] - level_adu))), QUANTISATION_NOISE_ADU)
+    level_adu, spread_adu = level_and_spread(cut[ring])
     is_hot = isolated_pixels(cut, level_adu, spread_adu)
     if is_hot.any():
         cut = repair_pixels(cut, is_hot)
-    sky, plane, noise_adu = sky_in(cut, ring)
+    sky, plane, noise_adu = sky_in(cut, ring, level_adu, spread_adu)
     intensity = table.take(cut)
     intensity -= plane_through(intensity, sky)
     # The sky is known: from here on only the star itself and what is close to it matter.
@@ -295,12 +296,12 @@ def _balanced_centre(fit: _Fit) -> tuple[float, float, float]:
     xx, xy, yy = _inverse(fit.covariance)
     inverse = np.array([[xx, xy], [xy, yy]])
     rows, columns = axes(fit.signal.shape)
-    heights = _heights(fit)
+    sums = _heights(fit) / WIDTHS ** np.array([[0.0], [2.0], [4.0]])
     x, y = fit.x, fit.y
     for _ in range(CENTRE_STEPS):
         parts = _parts(_gaussian(fit.signal.shape, x, y, fit.covariance))
         # The star, and what times (inverse covariance) (distance) is its slope, and the slope of that.
-        star, slope, bend = (np.tensordot(heights / WIDTHS**power, parts, axes=1) for power in (0, 2, 4))
+        star, slope, bend = (sums @ parts.reshape(WIDTHS.size, -1)).reshape(-1, *fit.signal.shape)
         variance = fit.noise_adu**2 + fit.shot_adu * np.maximum(star, 0.0)
         weight = slope / variance
         dx, dy = columns[0] - x, rows[:, 0] - y

@@ -18,7 +18,7 @@ RING_WIDTH = 1.0
 """The sky is seen in a ring around the aperture, this share of the aperture's radius wide: wide enough for the slope
 of its plane to add less than 1 % to the error of a faint star's centre."""
 
-CLIP_STEPS = 3
+CLIP_STEPS = 2
 CLIP_SIGMAS = 3.0
 CLIPPED_SHARE_OF_SPREAD = 0.9866
 """Standard deviation of a normal distribution of unit width cut at 3 sigma."""
@@ -50,17 +50,29 @@ def ring_around(shape: tuple[int, ...], x: float, y: float, aperture_px: float) 
     return ring
 
 
-def sky_in(cut: Frame, ring: Mask) -> tuple[Mask, Array, float]:
+def level_and_spread(values: Frame) -> tuple[float, float]:
+    """Median of the values and their standard deviation around it, neither of which feels a few stars.
+
+    The deviation is told by the median of deviations; where a camera's offset is so low that the noise of a dark sky is
+    cut at 0, by what is left of it. It is never below that of rounding.
+    """
+    middle = values.size // 2
+    level = float(np.partition(values, middle)[middle])
+    spread = 1.4826 * float(np.partition(np.abs(values - level), middle)[middle])
+    if np.count_nonzero(values == 0) > MAX_DARK_SHARE * values.size:
+        spread = max(spread, _noise_cut_at_zero(values))
+    return level, max(spread, QUANTISATION_NOISE_ADU)
+
+
+def sky_in(cut: Frame, ring: Mask, level_adu: float, spread_adu: float) -> tuple[Mask, Array, float]:
     """Pixels of the ring that show the sky, the plane through them (shape of `cut`), and their noise around it.
 
-    Pixels more than 3 sigma off the plane (other stars, hot pixels) are left out.
+    Pixels more than 3 sigma off the plane (other stars, hot pixels) are left out; `level_adu` and `spread_adu` of
+    `level_and_spread` are where that starts.
     """
-    values = cut[ring]
-    middle = float(np.median(values))
-    is_cut = np.count_nonzero(values == 0) > MAX_DARK_SHARE * values.size
-    least_adu = max(_noise_cut_at_zero(values) if is_cut else 0.0, QUANTISATION_NOISE_ADU)
-    noise_adu = max(1.4826 * float(np.median(np.abs(values - middle))), least_adu)
-    residual = cut - middle
+    is_cut_at_zero = np.count_nonzero(cut[ring] == 0) > MAX_DARK_SHARE * np.count_nonzero(ring)
+    least_adu = spread_adu if is_cut_at_zero else QUANTISATION_NOISE_ADU
+    residual, noise_adu = cut - level_adu, spread_adu
     for _ in range(CLIP_STEPS):
         # A whole step of rounding always belongs to the sky, however dark and quiet it is.
         sky = ring & (np.abs(residual) <= max(CLIP_SIGMAS * noise_adu, 1.0))

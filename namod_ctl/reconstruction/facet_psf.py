@@ -115,9 +115,19 @@ def evaluate(parameters: Array, theta_rad: Array) -> tuple[Array, Array]:
     return light, jacobian
 
 
+def covariances_of(log_size: Array, e1: Array, e2: Array) -> Array:
+    """Covariances exp(2 s) expm(2 E), shape (n, 2, 2), rad^2, of sizes and elongations of shape (n,)."""
+    e = 2.0 * np.hypot(e1, e2)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = np.where(e > 1e-6, 2.0 * np.sinh(e) / e, 2.0)
+    scale, cosh = np.exp(2.0 * log_size), np.cosh(e)
+    entries = [cosh + ratio * e1, ratio * e2, ratio * e2, cosh - ratio * e1]
+    covariances: Array = np.stack([scale * entry for entry in entries], axis=-1).reshape(-1, 2, 2)
+    return covariances
+
+
 def covariance_of_light(parameters: Array) -> Array:
     """Second central moments of the point spread function, shape (2, 2), rad^2."""
-    root, _, _ = _inverse_root(*parameters[LOG_SIZE : ELONGATION_2 + 1])
-    inverse = np.linalg.inv(root)
-    covariance: Array = inverse @ inverse
+    log_size, e1, e2 = parameters[[LOG_SIZE, ELONGATION_1, ELONGATION_2], None]
+    covariance: Array = covariances_of(log_size, e1, e2)[0]
     return covariance

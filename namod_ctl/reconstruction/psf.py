@@ -23,6 +23,7 @@ from namod_ctl.reconstruction.facet_psf import (
     LOG_FLUX,
     LOG_SIZE,
     covariance_of_light,
+    covariances_of,
 )
 from namod_ctl.reconstruction.histograms import histogram_responses
 from namod_ctl.reconstruction.responses import ResponseTable
@@ -72,24 +73,18 @@ def area_now(fits: Sequence[FacetFit], variance_factors: Array, seed: int = 0) -
     """
     rng = np.random.default_rng(seed)
     basic = [LOG_FLUX, *range(CENTRE.start, CENTRE.stop), LOG_SIZE, ELONGATION_1, ELONGATION_2]
-    steps = []
+    flux, centre, cov = [], [], []
     for fit, factor in zip(fits, variance_factors, strict=True):
         step = rng.multivariate_normal(
             np.zeros(len(basic)), factor * fit.covariance[np.ix_(basic, basic)], _N_DRAWS, method="eigh"
         )
         step[:, [0, 3, 4, 5]] = np.clip(step[:, [0, 3, 4, 5]], -_MAX_LOG_STEP, _MAX_LOG_STEP)
-        steps.append(step)
-    areas = []
-    for k in range(_N_DRAWS):
-        flux, centre, cov = [], [], []
-        for fit, step in zip(fits, steps, strict=True):
-            drawn = fit.parameters.copy()
-            drawn[basic] += step[k]
-            flux.append(fit.scale * math.exp(drawn[LOG_FLUX]))
-            centre.append(drawn[CENTRE])
-            cov.append(covariance_of_light(drawn))
-        light = LightOfFacets(np.array(flux), np.array(centre), np.array(cov))
-        areas.append(area_of_covariance(light.combined()[1]))
+        drawn = fit.parameters[basic] + step
+        flux.append(fit.scale * np.exp(drawn[:, 0]))
+        centre.append(drawn[:, 1:3])
+        cov.append(covariances_of(drawn[:, 3], drawn[:, 4], drawn[:, 5]))
+    draws = zip(*(np.stack(values, axis=1) for values in (flux, centre, cov)), strict=True)
+    areas = [area_of_covariance(LightOfFacets(*draw).combined()[1]) for draw in draws]
     best = area_of_covariance(light_of_fits(fits).combined()[1])
     return AreaOfPsf(best, float(np.std(areas)))
 

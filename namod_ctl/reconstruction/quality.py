@@ -19,7 +19,7 @@ _LIT_SHARE = 0.1  # a record counts as in the PSF from this share of the facet's
 _MIN_LIT = 2  # one lit record is a direction, not a centre
 _MIN_CONTRAST = 3.0  # lit responses over the 95 % level of the dark ones; pure noise reaches 2
 _MIN_DARK = 20  # dark records needed to know their level
-_MAX_SIGMA_SIZES = 2.0  # beyond twice the PSF's own width a correction scatters the light more than it gathers
+_MAX_SIGMA_SIZES = 3.0  # the 3 sigma edge of a PSF: beyond, a corrected facet may miss the others altogether
 _CUT_SIGMA, _CUT_SHARE = 2.0, 0.1  # a PSF is cut when more than this share of its 2 sigma ellipse was never visited
 _N_ELLIPSE = 48
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -269,8 +269,9 @@ def _turning_cov(mount: Mount, goniometer_resolution_rad: float) -> Array:
 def _bootstrap_area(table: ResponseTable, bin_size_rad: float, n_draws: int = 50) -> float:
     """Uncertainty of the histogram's area when records are drawn anew."""
     rng = np.random.default_rng(0)
+    together = replace(table, facet_ids=(0,), response=np.nan_to_num(table.response).sum(axis=1, keepdims=True))
     areas = [
-        area_of_histograms(table.select(rng.integers(0, table.n_records, table.n_records)), bin_size_rad)
+        area_of_histograms(together.select(rng.integers(0, table.n_records, table.n_records)), bin_size_rad)
         for _ in range(n_draws)
     ]
     return float(np.nanstd(areas))

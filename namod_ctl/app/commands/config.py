@@ -13,7 +13,9 @@ from namod_ctl.app.build import build_instrument
 from namod_ctl.app.config import builtin_names, load_config
 from namod_ctl.app.config_summary import Summary, summarize, warnings_of
 
-app = typer.Typer(help="Check the config of an instrument, list those that come with the program.")
+app = typer.Typer(
+    add_completion=False, help="Check the config of an instrument, list those that come with the program."
+)
 
 
 @app.command("check")

@@ -31,7 +31,9 @@ RECORDS_WORTH_A_PROCESS = 20  # starting one takes as long as measuring some rec
 EXIT_INTERRUPTED = 130  # what shells report for a program that was ended by Ctrl-C
 SAME_ANGLE_DECIMALS = 12  # of a degree: takes the rounding of deg -> rad -> deg away
 
-app = typer.Typer(help="Make a run of records that another program recorded.", no_args_is_help=True)
+app = typer.Typer(
+    add_completion=False, help="Make a run of records that another program recorded.", no_args_is_help=True
+)
 
 OutOption = Annotated[Path, typer.Option("--out", help="Folder of the new run; must not exist yet.")]
 ConfigOption = Annotated[str, typer.Option("--config", help="Instrument: a TOML file, or the name of a built-in one.")]
