@@ -22,8 +22,8 @@ Array = NDArray[np.float64]
 STAR_WIDTH_IN_BLOCKS = 2.0
 """The frame is halved as long as a star stays at least this wide, in pixels of the shrunk frame."""
 
-CELL_WIDTH_IN_BLOCKS = 16
-"""Width of a cell of the background map: 6 to 8 stars wide."""
+CELL_HALVINGS = 4
+"""Of the shrunk frame, to the cells of the background map: these are 4 to 8 stars wide."""
 
 FILLED_CELL_SHARE = 0.25
 """Of full scale: a cell of the background map so much brighter than those around it shows no background."""
@@ -181,8 +181,10 @@ def _background_map(small: Frame, full_scale_adu: float) -> Frame:
     A star adds 3 % of its own height to the mean of its cell, and is not taken out: medians over many cells would, but
     lag behind moonlight. Only where light fills a cell do the cells around it speak.
     """
-    n_columns, n_rows = (max(1, size // CELL_WIDTH_IN_BLOCKS) for size in small.shape[::-1])
-    cells = cv2.resize(small, (n_columns, n_rows), interpolation=cv2.INTER_AREA)
+    cells = small
+    for _ in range(CELL_HALVINGS):
+        half = (max(1, cells.shape[1] // 2), max(1, cells.shape[0] // 2))
+        cells = cv2.resize(cells, half, interpolation=cv2.INTER_AREA)
     around = cv2.medianBlur(cells, 5)
     cells = np.where(cv2.subtract(cells, around) > FILLED_CELL_SHARE * full_scale_adu, around, cells)
     return np.asarray(cv2.resize(cells, small.shape[::-1], interpolation=cv2.INTER_LINEAR))

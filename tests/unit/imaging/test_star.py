@@ -213,8 +213,8 @@ def test_the_intensity_of_a_linear_camera_does_not_know_the_sky():
     expected = (star_at(200.3, 150.2, 130.0) / 255.0).sum()
     for sky, tolerance in ((np.zeros(SHAPE), 0.004), (SKIES["gradient"], 0.004), (SKIES["moonlight"], 0.01)):
         _, _, intensity = samples(lambda x, y, sky=sky: star_at(x, y, 130.0) + sky, 30, seed=24, finder=finder)
-        # 1300 pixels of 1 to 2 ADU noise on 15 400 ADU: 0.4 %, of 30 stars 0.1 %. Moonlight half a degree wide is curved:
-        # a plane around the star is up to 0.1 ADU above it.
+        # 1300 pixels of 1 to 2 ADU noise on 15 400 ADU: 0.4 %, of 30 stars 0.1 %. Moonlight half a degree wide is
+        # curved: a plane around the star is up to 0.1 ADU off.
         assert intensity.mean() == pytest.approx(expected, rel=tolerance)
 
 
