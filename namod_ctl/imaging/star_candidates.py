@@ -37,8 +37,8 @@ STRIP_ROWS = 192
 MAX_SPOT_SHARE = 1.0 / 16.0
 """With more of the frame above the background than this there is nothing that could be a star among it."""
 
-N_NOISE_ROWS = 32
-"""Rows that are read for the noise: 80 000 pixels of FACT's star camera give it to 0.3 %."""
+N_NOISE_ROWS = 48
+"""Rows of the shrunk frame that are read for the noise: 30 000 pixels of FACT's star camera give it to 1 %."""
 
 MAX_HOT_PER_BLOCK = 4
 
@@ -85,7 +85,8 @@ class FirstLook:
     spots
         Brightest first; none of them much fainter than the share of the brightest that was asked for.
     noise_adu
-        Standard deviation of one pixel, of the frame as a whole.
+        Standard deviation of one pixel, of the frame as a whole; rough where it is below 2, for the means of blocks are
+        rounded.
     sky_adu
         Median of the background.
     n_isolated
@@ -104,14 +105,14 @@ class FirstLook:
     bright_share: float
 
 
-def pixel_noise_adu(frame: Frame) -> float:
+def _noise_adu(small: Frame) -> float:
     """Standard deviation of one pixel of a frame (rows, columns), from differences of pixels two columns apart.
 
     Differences beyond 4 standard deviations (stars, hot pixels) do not count. Never below the noise of rounding.
     """
-    rows = frame[:: max(1, frame.shape[0] // N_NOISE_ROWS)]
+    rows = small[:: max(1, small.shape[0] // N_NOISE_ROWS)]
     difference = cv2.absdiff(rows[:, 2:], rows[:, :-2])
-    n_levels = int(np.iinfo(frame.dtype).max) + 1
+    n_levels = int(np.iinfo(small.dtype).max) + 1
     count = cv2.calcHist([difference], [0], None, [n_levels], [0, n_levels]).ravel().astype(np.float64)
     n_below = np.cumsum(count)
     square_sum = np.cumsum(count * np.arange(n_levels, dtype=np.float64) ** 2)
@@ -128,13 +129,13 @@ def first_look(frame: Frame, star_size_px: float, full_scale_adu: float, fainter
 
     Spots below `fainter_share` of the brightest one's peak are left out.
     """
-    noise_adu = pixel_noise_adu(frame)
     small, n_side = _shrink(frame, star_size_px)
     background = _background_map(small, full_scale_adu)
     sky_adu = float(np.median(background[::8, ::8]))
-    # Rounding of every halving adds to what is left of the pixel noise.
-    n_halvings = n_side.bit_length() - 1
-    small_noise_adu = (noise_adu**2 / n_side**2 + (n_halvings + 1) * QUANTISATION_NOISE_ADU**2) ** 0.5
+    small_noise_adu = _noise_adu(small)
+    # Every halving rounds to whole numbers; what is left above that comes from n_side**2 pixels.
+    rounding = QUANTISATION_NOISE_ADU**2 * (4.0 / 3.0 if n_side > 1 else 0.0)
+    noise_adu = max(n_side * max(small_noise_adu**2 - rounding, 0.0) ** 0.5, QUANTISATION_NOISE_ADU)
     limit = math.ceil(SPOT_SIGMAS * small_noise_adu)
     is_above = cv2.subtract(small, background) > limit
     bright_share = np.count_nonzero(is_above) / small.size

@@ -143,17 +143,17 @@ def make_run(
 def instrument(n_facets=30):
     """A telescope of so many facets on tripods that aims at the star camera's calibrated axis."""
     n = int(np.ceil(np.sqrt(n_facets)))
+    x, y = np.array([(i % n - (n - 1) / 2, i // n - (n - 1) / 2) for i in range(n_facets)]).T * 0.62
+    focal_length_m = 4.889
+    z = focal_length_m - np.sqrt(focal_length_m**2 - x**2 - y**2)  # Davies-Cotton
     facets = tuple(
-        Facet(
-            i + 1, np.array([(i % n - n / 2) * 0.62, (i // n - n / 2) * 0.62, 0.0]), 4.889, FacetShape.HEXAGON, 0.606
-        )
-        for i in range(n_facets)
+        Facet(i + 1, np.array([x[i], y[i], z[i]]), focal_length_m, FacetShape.HEXAGON, 0.606) for i in range(n_facets)
     )
     angle = 2 * np.pi / 3 * np.arange(3)
     tripod = Mount(0.295 * np.stack([np.cos(angle), np.sin(angle)], axis=1), False, 0.05, pitch_m_per_turn=1e-3)
     law = RadiometricLaw(1.0, -1.0, 0.0)
     camera = CameraModel("camera", 640, 480, 4e-5, np.array([319.5, 239.5]), True, CameraOrientation(), law)
-    reflector = Reflector(4.889, facets)
+    reflector = Reflector(focal_length_m, facets)
     return Instrument(
         "test dish", reflector, dict.fromkeys(reflector.ids, tripod), camera, camera, {}, 5 * DEG, 0.025 * DEG
     )
