@@ -40,7 +40,7 @@ def test_fact_is_explained(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
         "62.54 x 46.90 deg",
         "+x to the right, +y up (not mirrored)",
         "log10 I = 1.03 log10 C -1.15 log10 (T/s) -0.19",
-        "not calibrated",
+        "at column 1280, row 960 (calibrated)",
         "30 of 30 facets",
         "fact: valid",
     ):

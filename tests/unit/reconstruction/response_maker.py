@@ -33,14 +33,23 @@ N_RAYS = 3000  # their counting noise, 3 % of a typical response, is below the n
 class MadeRun:
     """A table and what it was made from.
 
-    `centre_rad` (n_facets, 2) and `cov_rad2` (n_facets, 2, 2) are moments of each facet's light over star directions,
-    `light` (n_records, n_facets) the responses without noise and background.
+    `centre_rad` (n_facets, 2), `cov_rad2` (n_facets, 2, 2) and `flux` (n_facets,) are the moments of each facet's light
+    over star directions, `light` (n_records, n_facets) the responses without noise and background.
     """
 
     table: ResponseTable
     centre_rad: np.ndarray
     cov_rad2: np.ndarray
+    flux: np.ndarray
     light: np.ndarray
+
+    @property
+    def a_sigma_rad2(self):
+        """A_sigma of all facets' light together."""
+        share = self.flux / self.flux.sum()
+        offset = self.centre_rad - share @ self.centre_rad
+        cov = np.einsum("j,jab->ab", share, self.cov_rad2) + np.einsum("j,ja,jb->ab", share, offset, offset)
+        return np.pi * np.sqrt(np.linalg.det(cov))
 
     def with_response(self, response):
         """The same run with other responses."""
@@ -129,15 +138,18 @@ def make_run(
     n_records = len(theta)
     centre = rng.normal(0, misalignment_rad, (n_facets, 2)) if centres_rad is None else np.asarray(centres_rad)
     light, cov = np.empty((n_records, len(centre))), np.empty((len(centre), 2, 2))
+    flux = rng.uniform(0.6, 1.2, len(centre))
     for j in range(len(centre)):
         rays = facet_rays(rng, figure)
         hits = cKDTree(rays + centre[j]).query_ball_point(theta, APERTURE_RAD, return_length=True)
-        light[:, j] = rng.uniform(0.6, 1.2) * hits / len(rays)
-        cov[j] = np.cov(rays.T) + APERTURE_RAD**2 / 4 * np.eye(2)  # a disc's variance per axis is a quarter of its radius^2
+        light[:, j] = flux[j] * hits / len(rays)
+        cov[j] = np.cov(rays.T) + APERTURE_RAD**2 / 4 * np.eye(
+            2
+        )  # a disc's variance per axis is a quarter of its radius^2
     response = light * np.exp(noise * rng.normal(size=light.shape)) + dark * np.abs(rng.normal(1, 0.3, light.shape))
     ids = tuple(range(1, len(centre) + 1))
     table = ResponseTable(ids, np.arange(1, n_records + 1), theta, np.full(n_records, np.nan), response)
-    return MadeRun(table, centre, cov, light)
+    return MadeRun(table, centre, cov, flux, light)
 
 
 def instrument(n_facets=30):
