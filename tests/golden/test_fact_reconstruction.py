@@ -34,9 +34,10 @@ pytestmark = pytest.mark.skipif(not DATA.exists(), reason="the FACT records of M
 
 def namod_ctl(*arguments):
     """Run the program; anything but exit code 0 fails the test."""
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as caught:
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["namod-ctl", *map(str, arguments)])
-        main()
+        with pytest.raises(SystemExit) as caught:
+            main()
     assert not caught.value.code
 
 
@@ -45,7 +46,8 @@ def run(tmp_path_factory):
     """The folder of the run with turns from the brightest records, as in 2014."""
     folder = tmp_path_factory.mktemp("fact") / "RUN"
     namod_ctl("import", "maps", DATA / "response_maps", "--out", folder)
-    namod_ctl("reconstruct", folder, "--estimator", "brightest")
+    # brightest records know no bins: the size is that of the area's other end, see the test of the bins
+    namod_ctl("reconstruct", folder, "--estimator", "brightest", "--bin-size-deg", "0.02")
     namod_ctl("instruct", folder)
     return folder
 
@@ -59,7 +61,7 @@ def table_and_instrument(run):
 
 @pytest.fixture(scope="module")
 def robust(table_and_instrument):
-    return reconstruct(*table_and_instrument)
+    return reconstruct(*table_and_instrument, bin_size_rad=deg_to_rad(0.005))
 
 
 @pytest.fixture(scope="module")
@@ -112,18 +114,15 @@ def test_area_is_the_published_one(robust):
     assert 0.5 < uncertainty < 0.25 * area
 
 
-def test_area_does_not_hang_on_the_bins(table_and_instrument, robust):
-    """The headline number less than 10 % between bins of 0.005 and 0.02 deg; the cleaned histogram's as well.
+def test_area_does_not_hang_on_the_bins(run, robust):
+    """Less than 10 % between bins of 0.005 deg (the fixture's) and of 0.02 deg (the run's)."""
+    wide = json.loads((run / "alignment.json").read_text())["a_sigma_arcmin2"]["now"]
+    narrow = rad2_to_arcmin2(robust.alignment.now.a_sigma_rad2)
+    assert max(wide, narrow) < 1.1 * min(wide, narrow)
 
-    The plain histogram of all records is far off: that is why the report says what was left out.
-    """
-    table, instrument = table_and_instrument
-    areas = [
-        rad2_to_arcmin2(reconstruct(table, instrument, bin_size_rad=deg_to_rad(size)).alignment.now.a_sigma_rad2)
-        for size in (0.005, 0.02)
-    ]
-    areas.append(rad2_to_arcmin2(robust.alignment.now.a_sigma_rad2))
-    assert max(areas) < 1.1 * min(areas)
+
+def test_bad_records_and_background_rule_the_plain_histogram(robust):
+    """The sum of H_psf as it comes is far off, by a factor of two: that is why the report says what was left out."""
     everything, without_bad, without_background = (rad2_to_arcmin2(area) for area in robust.histogram_areas)
     assert everything > 1.5 * PUBLISHED_AREA_ARCMIN2
     assert everything > without_bad > without_background

@@ -25,6 +25,7 @@ from namod_ctl.app.instructions import (
 )
 from namod_ctl.app.overlay import PNG_FILE, draw_instructions
 from namod_ctl.core.errors import ConfigError, StoreError
+from namod_ctl.core.flags import FacetFlag
 from namod_ctl.optics.instrument import Instrument
 from namod_ctl.reconstruction.alignment import Alignment
 from namod_ctl.store.frames import write_file_durably
@@ -134,6 +135,13 @@ def _report(alignment: Alignment, instructions: tuple[FacetInstruction, ...], fo
     for instruction in instructions:
         if instruction.verdict is Verdict.DO_NOT_TURN:
             typer.echo(f"Facet {instruction.facet_id}: do not turn: {'; '.join(instruction.reasons)}.")
+    doubtful = [facet.facet_id for facet in alignment.facets if facet.flags & FacetFlag.RESTS_ON_BAD_RECORD]
+    if doubtful:
+        ids = ", ".join(map(str, doubtful))
+        typer.echo(
+            f"Estimator {alignment.estimator} does not leave out bad records: the turns of facets {ids} rest on one. "
+            "Turn by the default estimator instead: namod-ctl reconstruct without --estimator."
+        )
     if alignment.facets_not_in_run:
         ids = ", ".join(map(str, alignment.facets_not_in_run))
         typer.echo(f"Not in this run, so without an instruction: {ids}.")

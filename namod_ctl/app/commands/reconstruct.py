@@ -73,7 +73,10 @@ def reconstruct_run(
     console.print(text, soft_wrap=True, markup=False)
     if comparison is not None:
         _print_halves(console, comparison)
-    console.print(f"Written to {run}: {ALIGNMENT_FILE} and its tables and pictures. Next: namod-ctl instruct {run}")
+    console.print(
+        f"Written to {run}: {ALIGNMENT_FILE}, {REPORT_FILE}, tables and pictures. Next: namod-ctl instruct {run}",
+        soft_wrap=True,
+    )
 
 
 def _write(run: Path, result: Reconstruction, instrument: Instrument, bin_size_rad: float) -> None:

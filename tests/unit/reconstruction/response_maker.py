@@ -23,7 +23,7 @@ DEG = np.pi / 180.0
 ARCMIN = DEG / 60.0
 
 FIGURE_RAD = DEG * np.array([0.012, 0.012, 0.012, 0.006, 0.006, 0.006])
-"""Spread of a facet's defocus, two astigmatisms, two comas and trefoil as image blur: widths of 1 to 2 arcmin, as FACT."""
+"""Spread of defocus, two astigmatisms, two comas and trefoil as image blur: widths of 1 to 2 arcmin, as FACT's."""
 ROUGHNESS_RAD = 0.009 * DEG
 APERTURE_RAD = 0.02 * DEG  # radius of FACT's camera lens seen from the dish, 1.7 mm over 4.889 m
 N_RAYS = 3000  # their counting noise, 3 % of a typical response, is below the noise of the records
@@ -78,7 +78,7 @@ def graded_disc(rng, n, contrast=10.0, radius_rad=0.35 * DEG):
 
 
 def wandering_path(rng, n, radius_rad=0.35 * DEG):
-    """Directions (n, 2) along a noisy spiral, as of a telescope that is steered by hand: dense inside, sparse outside."""
+    """Directions (n, 2) along a noisy spiral, as of a telescope steered by hand: dense inside, sparse outside."""
     t = np.linspace(0.05, 1.0, n)
     angle = 30.0 * t + 0.3 * np.cumsum(rng.normal(0, 0.1, n))
     radius = radius_rad * t
@@ -86,7 +86,7 @@ def wandering_path(rng, n, radius_rad=0.35 * DEG):
 
 
 def facet_rays(rng, figure=1.0, n_rays=N_RAYS):
-    """Directions (n_rays, 2) of a facet's rays about their mean: low-order figure errors over a hexagon, and roughness."""
+    """Directions (n_rays, 2) of a facet's rays about their mean: low-order figure errors and roughness."""
     x, y = _hexagon(rng, n_rays)
     defocus, astig, astig_45, coma_x, coma_y, trefoil = rng.normal(size=6) * FIGURE_RAD * figure
     slope_x = (
