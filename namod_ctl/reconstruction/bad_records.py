@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from namod_ctl.core.units import rad_to_deg
 from namod_ctl.reconstruction.alignment import BadRecord
 from namod_ctl.reconstruction.facet_fit import FacetFit, NoiseModel, student_loss, to_y, y_slope
-from namod_ctl.reconstruction.facet_psf import BACKGROUND, evaluate
+from namod_ctl.reconstruction.facet_psf import evaluate
 from namod_ctl.reconstruction.responses import ResponseTable
 
 Array = NDArray[np.float64]
@@ -30,8 +30,10 @@ Array = NDArray[np.float64]
 _EVIDENCE = 12.0  # natural log units a story must win by, beyond the price of its free numbers
 _MIN_SHIFT_SIZES = 3.0  # a direction counts as another one from this many typical widths on
 _MIN_FACTOR = 1.5  # transparency changes below this are the ordinary noise of a night
+_LIT, _MIN_LIT = 0.1, 3  # share of its scale from which a facet is lit, and how many of them can vouch for a factor
 _LOG_FACTORS = np.linspace(-2.4, 2.4, 13)
 _DARK, _SHOT, _RELATIVE = 0.01, 0.1, 0.3  # least noise granted to a witness, see NoiseModel
+_SIGMA_80 = 1.282  # 80 % of a gaussian lie within this many sigma
 _MAX_GRID = 4000
 _PRICE_PER_NUMBER = 3.0  # log of the choices one free number offers
 
@@ -42,7 +44,8 @@ class _Witnesses:
 
     columns: list[int]
     scale: Array
-    background: Array
+    background: Array  # [facet], level of the dark records
+    dark: Array  # [facet], scatter of the dark records about it, of whatever cause
     light_at_records: Array  # [record, facet]
     model_variance: Array  # [record, facet], of the light, from the uncertainty of the fits
 
@@ -74,15 +77,20 @@ def find_bad_records(
 
 
 def _question(table: ResponseTable, columns: list[int], facets: list[FacetFit]) -> _Witnesses:
-    light, variance = [], []
-    for fit in facets:
+    light, variance, background, dark = [], [], [], []
+    for j, fit in zip(columns, facets, strict=True):
         facet_light, jacobian = evaluate(fit.parameters, table.theta_rad)
         light.append(facet_light)
         variance.append(np.einsum("ij,jk,ik->i", jacobian, fit.covariance, jacobian))
+        unlit = table.response[facet_light < _DARK, j] / fit.scale
+        unlit = unlit[np.isfinite(unlit)]
+        background.append(float(np.median(unlit)) if len(unlit) else 0.0)
+        dark.append(float(np.quantile(np.abs(unlit - background[-1]), 0.8)) / _SIGMA_80 if len(unlit) else 0.0)
     return _Witnesses(
         columns,
         np.array([fit.scale for fit in facets]),
-        np.array([max(fit.parameters[BACKGROUND], 0.0) for fit in facets]),
+        np.maximum(background, 0.0),
+        np.array(dark),
         np.stack(light, axis=1),
         np.stack(variance, axis=1),
     )
@@ -94,7 +102,7 @@ def _loss(
     """Loss of each response (last axis: facets) given the light of each facet; not measured ones lose nothing."""
     measured = response / witnesses.scale
     expected = light + witnesses.background
-    variance = y_slope(expected) ** 2 * (noise.variance(light) + model_variance)
+    variance = y_slope(expected) ** 2 * (noise.variance(light) + witnesses.dark**2 + model_variance)
     loss = student_loss(to_y(np.nan_to_num(measured)) - to_y(expected), variance)
     shared: Array = np.where(np.isfinite(measured), loss, 0.0)
     return shared
@@ -125,7 +133,7 @@ def _judge(
 
     variance = witnesses.model_variance[i]
     scaled = _loss(response, witnesses, factors * light, noise, factors**2 * variance).sum(axis=1)
-    glare = np.geomspace(0.01, 3.0, 13)[:, None] * np.median(witnesses.scale) / witnesses.scale
+    glare = np.geomspace(0.05, 3.0, 10)[:, None] * np.median(witnesses.scale) / witnesses.scale
     added = _loss(response, witnesses, light + glare, noise, 0.0).sum(axis=1)
     elsewhere = np.stack(
         [
@@ -134,8 +142,10 @@ def _judge(
         ]
     )
     k_grid = int(np.argmin(elsewhere.min(axis=0)))
+    # a factor needs facets that should be lit, and a glare must be worth the name
+    can_scale = np.count_nonzero(light > _LIT) >= _MIN_LIT
     stories = {
-        "cloud_edge": here - float(scaled.min()) - _PRICE_PER_NUMBER,
+        "cloud_edge": -np.inf if not can_scale else here - float(scaled.min()) - _PRICE_PER_NUMBER,
         "stray_light": here - float(added.min()) - _PRICE_PER_NUMBER,
         "wrong_star": here - float(elsewhere.min()) - 3.0 * _PRICE_PER_NUMBER,
     }

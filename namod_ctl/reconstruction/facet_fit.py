@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from namod_ctl.reconstruction.facet_psf import BACKGROUND, CENTRE, ELONGATION_1, ELONGATION_2, evaluate
+from namod_ctl.reconstruction.facet_psf import CENTRE, ELONGATION_1, ELONGATION_2, background_of, evaluate
 
 Array = NDArray[np.float64]
 
@@ -23,7 +23,7 @@ EPSILON = 0.02  # responses below this share of the facet's scale are "dark" and
 STUDENT_NU = 4.0  # heavy enough for field data, still 90 % efficient on gaussian noise
 _MAX_ELONGATION = 1.2  # axis ratio exp(2 * 1.2) = 11: beyond, a "facet" is a streak
 _MAX_STEPS = 40
-_SCALE_RANGE = 30.0
+_SCALE_RANGE = 1000.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +121,7 @@ def fit_facet(
 
     def linearize(parameters: Array) -> tuple[Array, Array, Array, Array, Array]:
         light, jacobian = evaluate(parameters, theta)
-        expected = light + parameters[BACKGROUND]
+        expected = light + background_of(parameters, theta)
         slope = y_slope(expected)
         return y - to_y(expected), slope[:, None] * jacobian, slope**2 * noise.variance(light), slope, light
 
@@ -164,15 +164,13 @@ def fit_facet(
 def response_scales(response: Array) -> Array:
     """Response of each facet when lit, roughly: its second largest, so that a single flash does not set it.
 
-    `response` has shape (n_records, n_facets). Kept within a factor `_SCALE_RANGE` of the median facet, so that a
-    dark facet is not magnified; all zero when nothing was ever lit.
+    `response` has shape (n_records, n_facets). Kept within a factor `_SCALE_RANGE` of the brightest facets, so that
+    a dark facet's noise is not magnified without end; all zero when nothing was ever lit.
     """
     second = np.sort(np.nan_to_num(response), axis=0)[-2] if len(response) > 1 else np.zeros(response.shape[1])
-    lit = second[second > 0.0]
-    if len(lit) == 0:
+    if not np.any(second > 0.0):
         return np.zeros(response.shape[1])
-    typical = np.median(lit)
-    scales: Array = np.clip(second, typical / _SCALE_RANGE, typical * _SCALE_RANGE)
+    scales: Array = np.maximum(second, np.quantile(second[second > 0.0], 0.9) / _SCALE_RANGE)
     return scales
 
 

@@ -2,7 +2,8 @@
 
 The normalized response of a facet over the star's direction Theta is modelled as
 
-    mu(Theta) = background + flux / (2 pi sqrt(det cov)) * exp(-|u|^2 / 2) * P(1 + sum_ab c_ab h_a(u_1) h_b(u_2)),
+    mu(Theta) = background + gradient . Theta
+                + flux / (2 pi sqrt(det cov)) * exp(-|u|^2 / 2) * P(1 + sum_ab c_ab h_a(u_1) h_b(u_2)),
     u = W (Theta - centre),
 
 with W the inverse square root of the covariance and h_n = He_n / sqrt(n!) the normalized probabilists'
@@ -13,7 +14,8 @@ is not pulled by skewed, flat-topped or ring-like point spread functions (docs/d
 P keeps the light positive: P(q) = (q + sqrt(q^2 + 4 d^2)) / 2 with a small d, P(q) ~ q wherever there is light.
 
 Parameters are a vector: log flux, centre x, centre y (rad), log of the size s = (log det cov) / 4,
-two elongations e1 and e2 (cov = exp(2 s) * expm(2 [[e1, e2], [e2, -e1]])), background, then c_ab by ascending order.
+two elongations e1 and e2 (cov = exp(2 s) * expm(2 [[e1, e2], [e2, -e1]])), background at
+Theta = 0 and its gradient (1/rad), then c_ab by ascending order.
 Responses are in units of a scale of the facet's own, the flux in that unit times rad^2.
 """
 
@@ -26,9 +28,10 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-LOG_FLUX, CENTRE_X, CENTRE_Y, LOG_SIZE, ELONGATION_1, ELONGATION_2, BACKGROUND = range(7)
-N_BASIC = 7  # parameters of a plain gaussian with background
+LOG_FLUX, CENTRE_X, CENTRE_Y, LOG_SIZE, ELONGATION_1, ELONGATION_2, BACKGROUND, GRADIENT_X, GRADIENT_Y = range(9)
+N_BASIC = 9  # parameters of a plain gaussian with background
 CENTRE = slice(CENTRE_X, CENTRE_Y + 1)
+GRADIENT = slice(GRADIENT_X, GRADIENT_Y + 1)
 MAX_ORDER = 6  # orders 3 to 6: 22 terms, shrunk to zero where the data does not ask for them
 _LOG_TWO_PI = math.log(2.0 * math.pi)
 _POSITIVITY = 0.03  # d of the positive map, a share of the peak
@@ -112,7 +115,14 @@ def evaluate(parameters: Array, theta_rad: Array) -> tuple[Array, Array]:
         v1, v2 = derivative @ offset.T
         jacobian[:, column] = by_u1 * v1 + by_u2 * v2
     jacobian[:, BACKGROUND] = 1.0
+    jacobian[:, GRADIENT] = theta_rad
     return light, jacobian
+
+
+def background_of(parameters: Array, theta_rad: Array) -> Array:
+    """Response of the unlit facet at `theta_rad` (n, 2), shape (n,)."""
+    background: Array = parameters[BACKGROUND] + theta_rad @ parameters[GRADIENT]
+    return background
 
 
 def covariances_of(log_size: Array, e1: Array, e2: Array) -> Array:

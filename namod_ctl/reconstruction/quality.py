@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,13 +12,15 @@ from scipy.spatial import Delaunay, QhullError
 from namod_ctl.core.flags import FacetFlag
 from namod_ctl.core.units import rad_to_arcmin
 from namod_ctl.reconstruction.facet_fit import FacetFit
-from namod_ctl.reconstruction.facet_psf import BACKGROUND, CENTRE, covariance_of_light
+from namod_ctl.reconstruction.facet_psf import CENTRE, covariance_of_light
+from namod_ctl.reconstruction.responses import ResponseTable
 
 Array = NDArray[np.float64]
 
 _LIT_SHARE = 0.1  # a record counts as in the PSF from this share of the facet's scale on
 _MIN_LIT = 2  # one lit record is a direction, not a centre
 _MIN_CONTRAST = 3.0  # lit responses over the 95 % level of the dark ones; pure noise reaches 2
+_FAR_SIGMA = 4.0  # records beyond are dark
 _MIN_DARK = 20  # dark records needed to know their level
 _MAX_SIGMA_SIZES = 3.0  # the 3 sigma edge of a PSF: beyond, a corrected facet may miss the others altogether
 _CUT_SIGMA, _CUT_SHARE = 2.0, 0.1  # a PSF is cut when more than this share of its 2 sigma ellipse was never visited
@@ -42,30 +45,47 @@ class ScanRegion:
 
 
 def n_lit_records(fit: FacetFit, response: Array) -> int:
-    """Number of records in the facet's window in which it was lit."""
-    lit = response[fit.used] / fit.scale - max(fit.parameters[BACKGROUND], 0.0) > _LIT_SHARE
-    return int(np.count_nonzero(lit))
+    """Number of records in the facet's window in which it was lit, whatever its background."""
+    dark = np.median(response[fit.used])
+    return int(np.count_nonzero(response[fit.used] - dark > _LIT_SHARE * fit.scale))
 
 
-def has_signal(fit: FacetFit, response: Array) -> bool:
-    """True when the facet's window is brighter than its dark records ever are (`response` (n,), NaN ignored)."""
-    is_dark = np.ones(len(response), dtype=np.bool_)
-    is_dark[fit.used] = False
-    dark = response[is_dark & np.isfinite(response)]
+def has_signal(fit: FacetFit, theta_rad: Array, response: Array) -> bool:
+    """True when the facet's point spread function is brighter than its dark records ever are.
+
+    `theta_rad` (n, 2) and `response` (n,) are all records of the facet, NaN is ignored. Dark records are those far from
+    the centre; where the scan has too few of those, the dimmer half of all.
+    """
+    measured = np.isfinite(response)
+    offset = theta_rad - fit.parameters[CENTRE]
+    inverse = np.linalg.inv(covariance_of_light(fit.parameters))
+    is_near = np.einsum("ia,ab,ib->i", offset, inverse, offset) < _FAR_SIGMA**2
+    dark, near = response[measured & ~is_near], response[measured & is_near]
     if len(dark) < _MIN_DARK:
-        return True
+        dark = np.sort(response[measured])[: max(1, int(measured.sum()) // 2)]
+    if len(near) < _MIN_LIT:
+        near = response[fit.used]
     level = float(np.median(dark))
     scatter = float(np.quantile(np.abs(dark - level), 0.95))
-    bright = np.sort(response[fit.used])[-_MIN_LIT:]
-    return bool(bright[0] - level > _MIN_CONTRAST * scatter)
+    return bool(np.sort(near)[-_MIN_LIT] - level > _MIN_CONTRAST * scatter)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Verdict:
+    """What stands against an estimate, in words, and the covariance of its centre with all that counted, (2, 2)."""
+
+    flags: FacetFlag
+    remarks: tuple[str, ...]
+    centre_cov_rad2: Array
 
 
 def judge_fit(
-    fit: FacetFit, response: Array, centre_cov_rad2: Array, region: ScanRegion, typical_size_rad: float
-) -> tuple[FacetFlag, tuple[str, ...]]:
-    """Flags of a facet's robust estimate and the remarks that explain them."""
-    if not has_signal(fit, response):
-        return FacetFlag.NO_SIGNAL, ("no response rises above the facet's background",)
+    fit: FacetFit, table: ResponseTable, column: int, centre_cov_rad2: Array, region: ScanRegion, size_rad: float
+) -> Verdict:
+    """Verdict on a facet's robust estimate; `size_rad` is the width against which its uncertainty is measured."""
+    response = table.response[:, column]
+    if not has_signal(fit, table.theta_rad, response):
+        return Verdict(FacetFlag.NO_SIGNAL, ("no response rises above the facet's background",), centre_cov_rad2)
     flags, remarks = FacetFlag.NONE, []
     centre = fit.parameters[CENTRE]
     if not region.contains(centre[None])[0]:
@@ -74,18 +94,20 @@ def judge_fit(
     elif (cut := _cut_share(fit, region)) > _CUT_SHARE:
         flags |= FacetFlag.PSF_CUT_BY_SCAN_EDGE
         remarks.append(f"{100.0 * cut:.0f} % of its outline lies beyond the recorded directions")
+        # the light that nobody saw may lie anywhere out there
+        centre_cov_rad2 = centre_cov_rad2 + cut**2 * covariance_of_light(fit.parameters)
     n_lit = n_lit_records(fit, response)
     if n_lit < _MIN_LIT:
         flags |= FacetFlag.FEW_RECORDS | FacetFlag.UNRELIABLE
         remarks.append(f"lit in {n_lit} records only, {_MIN_LIT} are needed: record longer around its centre")
     sigma = math.sqrt(float(np.linalg.eigvalsh(centre_cov_rad2)[-1]))
-    limit = _MAX_SIGMA_SIZES * typical_size_rad
+    limit = _MAX_SIGMA_SIZES * size_rad
     if sigma > limit:
         flags |= FacetFlag.LARGE_UNCERTAINTY | FacetFlag.UNRELIABLE
         remarks.append(
             f"uncertain by {rad_to_arcmin(sigma):.1f} arcmin, the limit is {rad_to_arcmin(limit):.1f} arcmin"
         )
-    return flags, tuple(remarks)
+    return Verdict(flags, tuple(remarks), centre_cov_rad2)
 
 
 def _cut_share(fit: FacetFit, region: ScanRegion) -> float:

@@ -20,7 +20,7 @@ from namod_ctl.reconstruction.bad_records import find_bad_records
 from namod_ctl.reconstruction.correction import FacetCorrection, common_centre, correct
 from namod_ctl.reconstruction.estimators import DEFAULT_ESTIMATOR, ESTIMATOR_NAMES, SIMPLE_ESTIMATORS, Centres
 from namod_ctl.reconstruction.facet_fit import FacetFit, centre_covariance
-from namod_ctl.reconstruction.facet_psf import BACKGROUND, covariance_of_light
+from namod_ctl.reconstruction.facet_psf import CENTRE, background_of, covariance_of_light
 from namod_ctl.reconstruction.psf import area_now, area_of_histograms, area_predicted, light_of_fits
 from namod_ctl.reconstruction.quality import ScanRegion, judge_fit, n_lit_records
 from namod_ctl.reconstruction.responses import ResponseTable
@@ -85,9 +85,10 @@ def reconstruct(
     unknown = sorted(set(table.facet_ids) - set(instrument.reflector.ids))
     if unknown:
         raise ConfigError(f"facet ids {unknown} of the run are not in the config of {instrument.name}")
-    bad, used, family, fits = _screen(table)
+    expected_rad = expected_size_rad(instrument)
+    bad, used, family, fits = _screen(table, expected_rad)
     factors = repetition_factor(used, family) * misfit_factors(fits)
-    size_rad = float(np.exp(family.log_size))
+    size_rad = min(float(np.exp(family.log_size)), expected_rad)
     region = ScanRegion(used.theta_rad)
     if estimator == DEFAULT_ESTIMATOR:
         centres, flags, remarks = _robust_centres(used, fits, factors, region, size_rad)
@@ -107,7 +108,7 @@ def reconstruct(
     seen = [fit for j in inside if (fit := fits[j]) is not None]
     if not seen:
         raise DataQualityError("no facet has an estimate within the recorded directions: record again, further out")
-    background = np.array([0.0 if fit is None else max(fit.parameters[BACKGROUND], 0.0) * fit.scale for fit in fits])
+    background = np.array([0.0 if fit is None else max(_background(fit), 0.0) for fit in fits])
     histogram_areas = (
         area_of_histograms(table, bin_size_rad),
         area_of_histograms(used, bin_size_rad),
@@ -134,11 +135,24 @@ def reconstruct(
     return Reconstruction(alignment, table, used, family, tuple(fits), histogram_areas, limit)
 
 
-def _screen(table: ResponseTable) -> tuple[list[BadRecord], ResponseTable, Family, list[FacetFit | None]]:
+def expected_size_rad(instrument: Instrument) -> float:
+    """Standard deviation per axis of one facet's light as the optics lead to expect, rad.
+
+    Ray traced, and not less than half the image of a star in the star camera: real mirrors have figure errors, and
+    the reflector camera an aperture.
+    """
+    moments = facet_moments(trace(instrument.reflector, _RAYS_PER_FACET))
+    variance = np.trace(moments.cov_m2, axis1=1, axis2=2).mean() / 2.0
+    return max(float(np.sqrt(variance)) / instrument.reflector.focal_length_m, instrument.star_size_rad / 2.0)
+
+
+def _screen(
+    table: ResponseTable, expected_rad: float
+) -> tuple[list[BadRecord], ResponseTable, Family, list[FacetFit | None]]:
     """Bad records, the table without them, and the fits to it."""
     bad: list[BadRecord] = []
     used = table
-    family, fits = fit_reflector(used)
+    family, fits = fit_reflector(used, expected_rad)
     for _ in range(_N_SCREENINGS):
         found = find_bad_records(table, fits, family.noise, float(np.exp(family.log_size)))
         if {record.index for record in found} == {record.index for record in bad}:
@@ -150,7 +164,7 @@ def _screen(table: ResponseTable) -> tuple[list[BadRecord], ResponseTable, Famil
                 f"{len(bad)} of {table.n_records} records disagree with the others: check that the star camera "
                 "followed one star, and record again"
             )
-        family, fits = fit_reflector(used)
+        family, fits = fit_reflector(used, expected_rad)
     return bad, used, family, fits
 
 
@@ -167,11 +181,11 @@ def _robust_centres(
             remarks.append(("its response is zero in every record",))
             continue
         facet_cov = factors[j] * centre_covariance(fit)
-        flag, why = judge_fit(fit, used.response[:, j], facet_cov, region, size_rad)
-        flags.append(flag)
-        remarks.append(why)
-        if not flag & FacetFlag.NO_SIGNAL:
-            theta[j], cov[j] = fit.parameters[1:3], facet_cov
+        verdict = judge_fit(fit, used, j, facet_cov, region, size_rad)
+        flags.append(verdict.flags)
+        remarks.append(verdict.remarks)
+        if not verdict.flags & FacetFlag.NO_SIGNAL:
+            theta[j], cov[j] = fit.parameters[CENTRE], verdict.centre_cov_rad2
     return Centres(theta, cov), flags, remarks
 
 
@@ -216,14 +230,19 @@ def _facet(
         width_major_rad=float(widths[1]),
         width_minor_rad=float(widths[0]),
         flux=np.nan if is_silent else float(flux),
-        background=np.nan if fit is None else float(fit.parameters[BACKGROUND] * fit.scale),
-        n_records_in_psf=0 if fit is None else n_lit_records(fit, used.response[:, j]),
+        background=np.nan if fit is None else _background(fit),
+        n_records_in_psf=0 if fit is None or is_silent else n_lit_records(fit, used.response[:, j]),
         flags=correction.flags,
         tilt_correction_rad=correction.tilt_correction_rad,
         leg_travel_m=correction.leg_travel_m,
         bolt_turn_deg=correction.bolt_turn_deg,
         remarks=remarks + correction.remarks,
     )
+
+
+def _background(fit: FacetFit) -> float:
+    """Response of the unlit facet where its centre is."""
+    return float(background_of(fit.parameters, fit.parameters[None, CENTRE])[0] * fit.scale)
 
 
 def _predict(

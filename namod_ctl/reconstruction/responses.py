@@ -64,5 +64,5 @@ def tabulate_responses(records: Iterable[Record], facet_ids: Sequence[int]) -> R
         np.array([record.index for record in accepted], dtype=np.int64),
         np.array([record.theta_rad for record in accepted], dtype=np.float64).reshape(n, 2),
         np.array([record.theta_uncertainty_rad for record in accepted], dtype=np.float64),
-        intensity / star[:, None],
+        np.where(np.isfinite(intensity), intensity, np.nan) / star[:, None],
     )

@@ -19,8 +19,8 @@ from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
 from namod_ctl.core.errors import DataQualityError
+from namod_ctl.core.units import rad_to_arcmin
 from namod_ctl.reconstruction.facet_fit import (
-    EPSILON,
     STUDENT_NU,
     FacetFit,
     NoiseModel,
@@ -34,17 +34,22 @@ from namod_ctl.reconstruction.facet_psf import (
     CENTRE,
     ELONGATION_1,
     ELONGATION_2,
+    GRADIENT,
     LOG_FLUX,
     LOG_SIZE,
     N_BASIC,
     TERM_ORDER,
 )
+from namod_ctl.reconstruction.quality import has_signal
 from namod_ctl.reconstruction.responses import ResponseTable
 
 Array = NDArray[np.float64]
 
 _N_LEARNING = 120  # facets from which the family is learned: enough for every common number to a few per cent
 _N_LEARNING_PASSES = 4
+_BACKGROUND = 0.1  # share of the scale: the unlit facet, and how much that may change over a window
+_SIZE_RANGE = 4.0  # mirrors may be worse than traced, the camera's aperture adds to it; not more than this
+_MIN_DARK_NOISE = 3e-4  # share of the scale; frames of few bits show exact zeros, which are not that certain
 _WINDOW_SIGMA = 6.0  # records within this many typical widths of the centre speak for a facet
 _MIN_RECORDS = 10  # a window with fewer is widened to the nearest
 _N_CANDIDATES = 8  # bright records tried as a starting point
@@ -58,9 +63,12 @@ class Family:
     Attributes
     ----------
     log_flux, log_flux_sigma
-        Log of the typical integral of a facet's normalized response over directions (rad^2), and its spread.
+        Log of the typical integral of a facet's normalized response over directions (rad^2), and its spread; None while
+        unknown: then each facet's own scale is taken for its peak.
     log_size, log_size_sigma
         Log of the typical standard deviation per axis of a facet's point spread function (rad), and its spread.
+    expected_log_size
+        What the optics lead to expect of `log_size`.
     elongation_sigma
         Spread of each elongation parameter about zero.
     term_sigma
@@ -68,10 +76,11 @@ class Family:
     """
 
     noise: NoiseModel
-    log_flux: float
+    log_flux: float | None
     log_flux_sigma: float
     log_size: float
     log_size_sigma: float
+    expected_log_size: float
     elongation_sigma: float
     term_sigma: Array
 
@@ -79,25 +88,38 @@ class Family:
         """Expectation of the parameters of a facet of that response scale; the centre is left free."""
         n = N_BASIC + (len(self.term_sigma) if has_terms else 0)
         mean, sigma = np.zeros(n), np.ones(n)
-        mean[LOG_FLUX], sigma[LOG_FLUX] = self.log_flux - np.log(scale), self.log_flux_sigma
+        own_flux = np.log(2.0 * np.pi) + 2.0 * self.log_size
+        mean[LOG_FLUX] = own_flux if self.log_flux is None else self.log_flux - np.log(scale)
+        sigma[LOG_FLUX] = self.log_flux_sigma
         mean[LOG_SIZE], sigma[LOG_SIZE] = self.log_size, self.log_size_sigma
         sigma[CENTRE] = 1.0  # rad: flat
         sigma[[ELONGATION_1, ELONGATION_2]] = self.elongation_sigma
-        sigma[BACKGROUND] = EPSILON
+        sigma[BACKGROUND] = _BACKGROUND
+        sigma[GRADIENT] = _BACKGROUND / (_WINDOW_SIGMA * np.exp(self.log_size))
         sigma[N_BASIC:] = self.term_sigma[: n - N_BASIC]
         return Prior(mean, sigma)
 
 
-def fit_reflector(table: ResponseTable, seed: int = 0) -> tuple[Family, list[FacetFit | None]]:
+def fit_reflector(
+    table: ResponseTable, expected_size_rad: float, seed: int = 0
+) -> tuple[Family, list[FacetFit | None]]:
     """The family of the run and the fit of every facet; None for a facet whose responses are all zero.
 
-    `seed` chooses the facets from which the family is learned where there are more than enough.
+    `expected_size_rad` is the standard deviation per axis of a facet's light that its optics lead to expect; the
+    typical size that is learned stays within a factor `_SIZE_RANGE` of it, so that a run without light can not be
+    explained by very wide facets. `seed` chooses the facets from which the family is learned where there are more
+    than enough.
 
     Raises
     ------
     DataQualityError
-        Nothing responded at all.
+        Nothing responded at all, or all records point at one place.
     """
+    if np.ptp(table.theta_rad, axis=0).max() < expected_size_rad:
+        raise DataQualityError(
+            f"all {table.n_records} records have the star at one place within "
+            f"{rad_to_arcmin(expected_size_rad):.1f} arcmin: let the telescope wander around the star and record again"
+        )
     scales = response_scales(table.response)
     live = _live(table, scales)
     if len(live) == 0:
@@ -106,12 +128,13 @@ def fit_reflector(table: ResponseTable, seed: int = 0) -> tuple[Family, list[Fac
     learning = live
     if len(live) > _N_LEARNING:
         learning = np.sort(np.random.default_rng(seed).choice(live, _N_LEARNING, replace=False))
-    family = _first_family(float(np.median(scales[live])), _first_log_size(table, learning, scales))
+    first_log_size = _first_log_size(table, learning, scales, expected_size_rad)
+    family = _first_family(first_log_size, float(np.log(expected_size_rad)))
     fits = [_first_fit(table, tree, int(j), family, float(scales[j])) for j in learning]
-    family = _learn(family, fits)
+    family = _learn(family, _lit(fits, table, learning))
     for _ in range(_N_LEARNING_PASSES - 1):
         fits = [_refit(table, tree, int(j), family, fit) for j, fit in zip(learning, fits, strict=True)]
-        family = _learn(family, fits)
+        family = _learn(family, _lit(fits, table, learning))
     known = dict(zip(learning.tolist(), fits, strict=True))
     result: list[FacetFit | None] = [None] * len(table.facet_ids)
     for j in live.tolist():
@@ -140,15 +163,23 @@ def _live(table: ResponseTable, scales: Array) -> NDArray[np.int64]:
     return np.flatnonzero((scales > 0.0) & (np.nan_to_num(table.response).max(axis=0) > 0.0))
 
 
-def _first_family(scale: float, log_size: float) -> Family:
+def _lit(fits: list[FacetFit], table: ResponseTable, columns: NDArray[np.int64]) -> list[FacetFit]:
+    """The fits of facets that show light: the others have nothing to teach about point spread functions."""
+    return [
+        fit
+        for fit, j in zip(fits, columns.tolist(), strict=True)
+        if has_signal(fit, table.theta_rad, table.response[:, j])
+    ]
+
+
+def _first_family(log_size: float, expected_log_size: float) -> Family:
     """Wide expectations to begin with; only the size is taken from the data."""
     term_sigma = 0.25 * 0.7 ** (TERM_ORDER - 3.0)
-    log_flux = np.log(2.0 * np.pi * scale) + 2.0 * log_size  # of a facet whose peak is the scale
     noise = NoiseModel(dark=0.01, shot=0.1, relative=0.2)
-    return Family(noise, float(log_flux), 1.0, log_size, 0.5, 0.25, term_sigma)
+    return Family(noise, None, 1.0, log_size, 0.5, expected_log_size, 0.25, term_sigma)
 
 
-def _first_log_size(table: ResponseTable, facets: NDArray[np.int64], scales: Array) -> float:
+def _first_log_size(table: ResponseTable, facets: NDArray[np.int64], scales: Array, expected_size_rad: float) -> float:
     """Log of a first guess of the typical width: scatter of the directions in which each facet was bright."""
     log_sizes = []
     for j in facets:
@@ -158,7 +189,14 @@ def _first_log_size(table: ResponseTable, facets: NDArray[np.int64], scales: Arr
         width = 1.4826 * np.median(np.abs(spread))  # MAD of both axes together
         if len(bright) >= 3 and width > 0.0:
             log_sizes.append(np.log(width))
-    return float(np.median(log_sizes)) if log_sizes else float(np.log(0.1 * np.ptp(table.theta_rad)))
+    expected = float(np.log(expected_size_rad))
+    return _near(float(np.median(log_sizes)), expected) if log_sizes else expected
+
+
+def _near(log_size: float, expected_log_size: float) -> float:
+    """`log_size` kept within the range that the optics allow."""
+    reach = np.log(_SIZE_RANGE)
+    return float(np.clip(log_size, expected_log_size - reach, expected_log_size + reach))
 
 
 def _window(tree: cKDTree, response: Array, centre_rad: Array, log_size: float) -> NDArray[np.int64]:
@@ -237,7 +275,7 @@ def _learn(family: Family, facets: list[FacetFit]) -> Family:
         square = (parameters[:, columns] - mean) ** 2 + variances[:, columns]  # type: ignore[index]
         return float(np.sqrt(np.mean(square)))
 
-    log_size = float(np.median(parameters[:, LOG_SIZE]))
+    log_size = _near(float(np.median(parameters[:, LOG_SIZE])), family.expected_log_size)
     term_sigma = family.term_sigma.copy()
     if parameters.shape[1] > N_BASIC:
         for order in np.unique(TERM_ORDER):
@@ -250,6 +288,7 @@ def _learn(family: Family, facets: list[FacetFit]) -> Family:
         float(np.clip(spread(LOG_FLUX, log_flux), 0.1, 1.0)),
         log_size,
         float(np.clip(spread(LOG_SIZE, log_size), 0.05, 0.5)),
+        family.expected_log_size,
         float(np.clip(spread([ELONGATION_1, ELONGATION_2]), 0.05, 0.4)),
         term_sigma,
     )
@@ -276,4 +315,5 @@ def _learn_noise(noise: NoiseModel, facets: list[FacetFit]) -> NoiseModel:
 
     start = np.log([noise.dark, noise.shot, noise.relative])
     found = minimize(loss, start, method="Nelder-Mead", options={"xatol": 0.01, "fatol": 0.1})
-    return NoiseModel(*np.exp(found.x).tolist())
+    dark, shot, relative = np.exp(found.x).tolist()
+    return NoiseModel(max(dark, _MIN_DARK_NOISE), shot, relative)
