@@ -312,6 +312,14 @@ def table_to_fits(table: QTable) -> bytes:
     return data.getvalue()
 
 
+def alignment_files(alignment: Alignment) -> dict[str, bytes]:
+    """alignment.json and the facet table, by file name."""
+    return {
+        FACET_TABLE_FILE: table_to_ecsv(facet_table(alignment)),
+        ALIGNMENT_FILE: alignment_to_json(alignment).encode(),
+    }
+
+
 def write_alignment(run_dir: Path, alignment: Alignment) -> None:
     """Write alignment.json and facets.ecsv into the run's folder, each of them whole or not at all.
 

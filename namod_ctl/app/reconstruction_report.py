@@ -2,36 +2,50 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
-from namod_ctl.core.flags import FACET_FLAG_MEANING, FacetFlag
+from namod_ctl.core.flags import FACET_FLAG_MEANING, REJECT_REASON_MEANING, FacetFlag, RejectReason
 from namod_ctl.core.units import rad2_to_arcmin2, rad_to_arcmin, rad_to_deg
 from namod_ctl.reconstruction.alignment import AreaOfPsf, FacetAlignment
+from namod_ctl.reconstruction.estimators import DEFAULT_ESTIMATOR
+from namod_ctl.reconstruction.halves import HalvesComparison
 from namod_ctl.reconstruction.reconstruct import Reconstruction
 
 REPORT_FILE = "report.txt"
 
 
 def _area(area: AreaOfPsf) -> str:
+    if not np.isfinite(area.a_sigma_rad2):
+        return "not known: this estimator states no uncertainty"
     value, uncertainty = rad2_to_arcmin2(area.a_sigma_rad2), rad2_to_arcmin2(area.uncertainty_rad2)
     return f"{value:.1f} +- {uncertainty:.1f} arcmin2" if uncertainty > 0.0 else f"{value:.1f} arcmin2"
 
 
-def report_text(result: Reconstruction) -> str:
-    """The report as plain text, lines ended by newlines."""
+def report_text(result: Reconstruction, n_rejected: Mapping[RejectReason, int]) -> str:
+    """The report as plain text, lines ended by newlines; `n_rejected` counts the records that never counted."""
     alignment = result.alignment
     axis_deg = rad_to_deg(alignment.axis_rad)
     lines = [
         f"{alignment.telescope}: {len(alignment.facets)} facets, {alignment.n_records} records, "
         f"{alignment.n_used} used, estimator {alignment.estimator}",
+    ]
+    if n_rejected:
+        reasons = ", ".join(f"{count} {REJECT_REASON_MEANING[reason]}" for reason, count in n_rejected.items())
+        lines.append(f"{sum(n_rejected.values())} more were rejected when they were measured: {reasons}")
+    if any(FacetFlag.NO_GAIN in facet.flags for facet in alignment.facets):
+        lines += ["", f"DO NOT TURN ANYTHING: {FACET_FLAG_MEANING[FacetFlag.NO_GAIN]}."]
+    lines += [
         "",
         "Point spread function of the whole reflector, A_sigma",
         f"  now                         {_area(alignment.now)}",
         f"  predicted after correction  {_area(alignment.predicted)}",
-        f"  ray-traced limit            {_area(result.limit)}",
+        f"  ray-traced limit            {_area(result.limit)} (these facets, own focal lengths, perfectly aligned)",
         f"  aim of the corrections      ({axis_deg[0]:+.4f}, {axis_deg[1]:+.4f}) deg",
         "",
-        f"Records left out as bad: {len(alignment.bad_records)} of {alignment.n_records}",
+        f"Bad records: {len(alignment.bad_records)} of {alignment.n_records}, "
+        + ("left out" if alignment.estimator == DEFAULT_ESTIMATOR else f"which estimator {alignment.estimator} uses"),
     ]
     for record in alignment.bad_records:
         facets = ", ".join(str(facet_id) for facet_id in record.facet_ids)
@@ -39,7 +53,7 @@ def report_text(result: Reconstruction) -> str:
     lines += ["", "What that changes", *(f"  {remark}" for remark in alignment.remarks), ""]
     if alignment.facets_not_in_run:
         missing = ", ".join(str(facet_id) for facet_id in alignment.facets_not_in_run)
-        lines += [f"Facets of the config that this run does not have: {missing}", ""]
+        lines += [f"Facets of the config that this run does not have: ids {missing}", ""]
     lines.append("facet  theta_x   theta_y    +-     width maj x min  lit  flags")
     lines.append("       arcmin    arcmin   arcmin   arcmin       records")
     lines += [_facet_line(facet) for facet in alignment.facets]
@@ -70,3 +84,21 @@ def _facet_line(facet: FacetAlignment) -> str:
         f"{facet.facet_id:5d} {x:+8.2f}  {y:+8.2f}  {uncertainty}   {major:5.2f} x {minor:5.2f}  "
         f"{facet.n_records_in_psf:6d}  {' '.join(facet.flags.names)}"
     ).rstrip()
+
+
+def halves_text(comparison: HalvesComparison) -> str:
+    """How well two independent halves of the run agree, as plain text."""
+    distance = rad_to_arcmin(comparison.distance_rad)
+    known = np.isfinite(distance)
+    lines = ["", "Even against odd records, distance of the two estimates of a facet"]
+    lines.append("                     facets  median / arcmin  rms / arcmin  width of pulls")
+    for name, chosen in (("all with an estimate", known), ("not flagged", known & ~comparison.is_flagged)):
+        if not chosen.any():
+            continue
+        pull = comparison.pull[chosen]
+        width = f"{np.std(pull):.2f}" if np.isfinite(pull).all() else "-"
+        rms = np.sqrt(np.mean(distance[chosen] ** 2))
+        lines.append(f"{name:20s} {int(chosen.sum()):6d} {np.median(distance[chosen]):16.2f} {rms:13.2f} {width:>15s}")
+    flagged = [str(facet) for facet, flag in zip(comparison.facet_ids, comparison.is_flagged, strict=True) if flag]
+    lines.append(f"Flagged in either half: {', '.join(flagged) or 'none'}")
+    return "\n".join(lines) + "\n"

@@ -21,6 +21,7 @@ class FacetFlag(Flag):
     LARGE_UNCERTAINTY = auto()
     BEYOND_TRAVEL_LIMIT = auto()
     RESTS_ON_BAD_RECORD = auto()
+    NO_GAIN = auto()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -33,7 +34,7 @@ class FacetFlag(Flag):
         return bool(self & _FORBIDS_TURNING)
 
 
-_FORBIDS_TURNING = FacetFlag.NO_SIGNAL | FacetFlag.UNRELIABLE | FacetFlag.BEYOND_TRAVEL_LIMIT
+_FORBIDS_TURNING = FacetFlag.NO_SIGNAL | FacetFlag.UNRELIABLE | FacetFlag.BEYOND_TRAVEL_LIMIT | FacetFlag.NO_GAIN
 
 FACET_FLAG_MEANING: dict[FacetFlag, str] = {
     FacetFlag.NO_SIGNAL: "the facet never lit up: no estimate",
@@ -44,6 +45,7 @@ FACET_FLAG_MEANING: dict[FacetFlag, str] = {
     FacetFlag.LARGE_UNCERTAINTY: "the estimate's uncertainty is too large to correct on",
     FacetFlag.BEYOND_TRAVEL_LIMIT: "the correction would move a leg beyond its limit: refused",
     FacetFlag.RESTS_ON_BAD_RECORD: "the estimate rests on a record that disagrees with all others",
+    FacetFlag.NO_GAIN: "the correction as a whole is not expected to make the mirror better: record more first",
 }
 
 
@@ -59,6 +61,7 @@ class RejectReason(StrEnum):
     STAR_STREAK = "star_streak"
     STAR_AT_EDGE = "star_at_edge"
     REFLECTOR_SATURATED = "reflector_saturated"
+    TELESCOPE_MOVED = "telescope_moved"
     FILE_MISSING = "file_missing"
     FILE_CORRUPT = "file_corrupt"
 
@@ -73,6 +76,7 @@ REJECT_REASON_MEANING: dict[RejectReason, str] = {
     RejectReason.STAR_STREAK: "the star is drawn out: satellite, aircraft or moving telescope",
     RejectReason.STAR_AT_EDGE: "the star touches the edge of the image",
     RejectReason.REFLECTOR_SATURATED: "a facet is saturated",
+    RejectReason.TELESCOPE_MOVED: "the telescope moved too far during the longer exposure",
     RejectReason.FILE_MISSING: "a file of the record is missing",
     RejectReason.FILE_CORRUPT: "a file of the record cannot be read",
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,6 +34,8 @@ class Record:
         Shape (n_facets,). Share of each polygon's pixels that are saturated, 0 to 1; NaN when unknown.
     star_exposure_s, reflector_exposure_s
         Exposures; NaN when unknown.
+    star_mid_exposure_s, reflector_mid_exposure_s
+        Middle of each camera's exposure, seconds since the run began; NaN when unknown.
     reject_reason
         None for a record that counts.
     detail
@@ -50,3 +53,10 @@ class Record:
     reflector_exposure_s: float
     reject_reason: RejectReason | None = None
     detail: str = ""
+    star_mid_exposure_s: float = math.nan
+    reflector_mid_exposure_s: float = math.nan
+
+    @property
+    def mid_exposure_difference_s(self) -> float:
+        """By how much the reflector's exposure was later than the star's, middle to middle; NaN when unknown."""
+        return self.reflector_mid_exposure_s - self.star_mid_exposure_s

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay, QhullError
 
+from namod_ctl.core.errors import DataQualityError
 from namod_ctl.core.flags import FacetFlag
 from namod_ctl.core.units import rad_to_arcmin
 from namod_ctl.reconstruction.facet_fit import FacetFit
@@ -28,18 +29,19 @@ _N_ELLIPSE = 48
 
 
 class ScanRegion:
-    """The convex hull of the recorded directions."""
+    """The convex hull of the recorded directions. Raises DataQualityError when they span no area."""
 
     def __init__(self, theta_rad: Array) -> None:
         try:
-            self._hull: Delaunay | None = Delaunay(theta_rad)
-        except (QhullError, ValueError):  # too few directions, or all on one line: nothing is inside
-            self._hull = None
+            self._hull = Delaunay(theta_rad)
+        except (QhullError, ValueError):
+            raise DataQualityError(
+                "the star's directions all lie on one line: let the telescope wander across the star in both "
+                "directions and record again"
+            ) from None
 
     def contains(self, theta_rad: Array) -> NDArray[np.bool_]:
         """For directions of shape (n, 2): which lie within the scan."""
-        if self._hull is None:
-            return np.zeros(len(theta_rad), dtype=np.bool_)
         inside: NDArray[np.bool_] = self._hull.find_simplex(theta_rad) >= 0
         return inside
 

@@ -100,28 +100,28 @@ def reconstruct(
     if not instrument.star_camera.axis_is_calibrated:
         axis_rad = common_centre(centres.theta_rad, np.where([flag.forbids_turning for flag in flags], 0.0, flux))
     corrections = correct(instrument, table.facet_ids, centres.theta_rad, flags, axis_rad)
-    inside = [
-        j
-        for j, (fit, flag) in enumerate(zip(fits, flags, strict=True))
-        if fit is not None and not flag & (FacetFlag.NO_SIGNAL | FacetFlag.PSF_OUTSIDE_SCAN)
-    ]
-    seen = [fit for j in inside if (fit := fits[j]) is not None]
+    seen = [j for j, flag in enumerate(flags) if fits[j] is not None and not flag & FacetFlag.NO_SIGNAL]
     if not seen:
-        raise DataQualityError("no facet has an estimate within the recorded directions: record again, further out")
+        raise DataQualityError("no facet shows light in the recorded directions: record again, further out")
+    now = area_now([fit for j in seen if (fit := fits[j]) is not None], factors[seen])
+    predicted, limit = _predict(instrument, table.facet_ids, centres, corrections, flux, axis_rad)
+    doubt_rad2 = np.hypot(now.uncertainty_rad2, predicted.uncertainty_rad2)
+    if now.a_sigma_rad2 - predicted.a_sigma_rad2 < doubt_rad2:
+        flags = [flag | FacetFlag.NO_GAIN for flag in flags]
+        corrections = correct(instrument, table.facet_ids, centres.theta_rad, flags, axis_rad)
     background = np.array([0.0 if fit is None else max(_background(fit), 0.0) for fit in fits])
     histogram_areas = (
         area_of_histograms(table, bin_size_rad),
         area_of_histograms(used, bin_size_rad),
         area_of_histograms(used, bin_size_rad, background),
     )
-    predicted, limit = _predict(instrument, table.facet_ids, centres, corrections, flux, axis_rad)
     alignment = Alignment(
         telescope=instrument.name,
         estimator=estimator,
         n_records=table.n_records,
         n_used=used.n_records if estimator == DEFAULT_ESTIMATOR else table.n_records,
         axis_rad=axis_rad,
-        now=area_now(seen, factors[inside]),
+        now=now,
         now_all_records=AreaOfPsf(histogram_areas[0], _bootstrap_area(table, bin_size_rad)),
         predicted=predicted,
         facets=tuple(
@@ -268,7 +268,8 @@ def _predict(
         0.0,
     )
     light = np.where(known & np.isfinite(flux), flux, 0.0)
-    if not np.any(light > 0.0):
+    if not np.any(light > 0.0) or not np.isfinite(centres.theta_cov_rad2[known]).all():
+        # without light there is nothing to predict, and without uncertainties nothing could be promised
         return AreaOfPsf(float("nan"), float("nan")), AreaOfPsf(limit, 0.0)
     shine = light > 0.0
     perfect = moments.cov_m2[shine] / reflector.focal_length_m**2

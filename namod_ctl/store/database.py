@@ -19,7 +19,7 @@ from pathlib import Path
 from namod_ctl.core.errors import StoreError
 
 DATABASE_NAME = "run.sqlite"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 APPLICATION_ID = 0x4E4D4F44  # "NMOD": tells a run from any other SQLite file
 BUSY_TIMEOUT_S = 10.0  # another program may hold the file for as long as one transaction lasts
 
@@ -33,7 +33,8 @@ CREATE TABLE records (
     star_intensity REAL,
     star_exposure_s REAL, reflector_exposure_s REAL,
     reject_reason TEXT,
-    detail TEXT NOT NULL
+    detail TEXT NOT NULL,
+    star_mid_exposure_s REAL, reflector_mid_exposure_s REAL
 );
 CREATE TABLE responses (
     record_index INTEGER NOT NULL REFERENCES records,
@@ -56,6 +57,12 @@ CREATE TABLE estimates (
     alignment_json TEXT NOT NULL,
     program_version TEXT NOT NULL
 );
+"""
+
+# what schema version 1 lacks
+_UPGRADE = """
+ALTER TABLE records ADD COLUMN star_mid_exposure_s REAL;
+ALTER TABLE records ADD COLUMN reflector_mid_exposure_s REAL;
 """
 
 _REMEDY = {
@@ -116,8 +123,10 @@ def connect_existing(path: Path, *, read_only: bool) -> sqlite3.Connection:
     with store_errors(path):
         connection = _connect(f"{path.absolute().as_uri()}?mode={mode}{'&immutable=1' if is_frozen else ''}")
         try:
-            _check_identity(connection, path)
+            version = _check_identity(connection, path)
             _configure(connection)
+            if version < SCHEMA_VERSION and not read_only:
+                connection.executescript(f"BEGIN IMMEDIATE; {_UPGRADE} PRAGMA user_version = {SCHEMA_VERSION}; COMMIT;")
         except BaseException:
             connection.close()
             raise
@@ -146,7 +155,8 @@ def _configure(connection: sqlite3.Connection) -> None:
     connection.execute("PRAGMA foreign_keys = ON")
 
 
-def _check_identity(connection: sqlite3.Connection, path: Path) -> None:
+def _check_identity(connection: sqlite3.Connection, path: Path) -> int:
+    """The schema version of the file."""
     application_id = connection.execute("PRAGMA application_id").fetchone()[0]
     version = connection.execute("PRAGMA user_version").fetchone()[0]
     if application_id != APPLICATION_ID:
@@ -156,3 +166,4 @@ def _check_identity(connection: sqlite3.Connection, path: Path) -> None:
             f"{path}: the run has schema version {version}, this program reads up to {SCHEMA_VERSION}; "
             "update namod-ctl (pip install --upgrade namod-ctl)"
         )
+    return int(version)

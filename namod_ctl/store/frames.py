@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from namod_ctl.core.errors import StoreError
 
+STAR_CAMERA, REFLECTOR_CAMERA = "star_camera", "reflector_camera"  # names under which frames are kept
 Frame = NDArray[np.uint8]
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"

@@ -190,7 +190,7 @@ class RunStore:
                 raise ValueError(f"record {record.index}: its arrays do not fit the run's {n_facets} facets")
         with store_errors(self._database), transaction(self._connection):
             self._connection.executemany(
-                "INSERT INTO records VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", map(_record_row, records)
+                "INSERT INTO records VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", map(_record_row, records)
             )
             self._connection.executemany(
                 "INSERT INTO responses VALUES (?, ?, ?, ?)",
@@ -200,9 +200,14 @@ class RunStore:
     def records(self) -> list[Record]:
         """All records, ascending by index."""
         with store_errors(self._database), transaction(self._connection, reads_only=True):
+            columns = {str(row[1]) for row in self._connection.execute("PRAGMA table_info(records)")}
+            # a run of schema version 1, opened to read only, has no times
+            times = "star_mid_exposure_s, reflector_mid_exposure_s"
+            times = times if "star_mid_exposure_s" in columns else "NULL, NULL"
             rows = self._connection.execute(
                 "SELECT record_index, label, theta_x_rad, theta_y_rad, theta_uncertainty_rad, star_intensity, "
-                "star_exposure_s, reflector_exposure_s, reject_reason, detail FROM records ORDER BY record_index"
+                f"star_exposure_s, reflector_exposure_s, {times}, reject_reason, detail FROM records "
+                "ORDER BY record_index"
             ).fetchall()
             responses = self._read_responses(len(rows))
         return [self._record(row, of_facets) for row, of_facets in zip(rows, responses, strict=True)]
@@ -245,6 +250,14 @@ class RunStore:
             return decode_png(data)
         except ValueError as error:
             raise StoreError(f"{file}: {error}") from error
+
+    def frame_files(self, camera: str) -> dict[int, tuple[Path, str]]:
+        """File and SHA-256 of every frame of that camera, by record index; for `frames.read_verified`."""
+        with store_errors(self._database):
+            rows = self._connection.execute(
+                "SELECT record_index, file_name, sha256 FROM frames WHERE camera = ?", (camera,)
+            ).fetchall()
+        return {int(index): (self.path / FRAMES_FOLDER / str(name), str(sha256)) for index, name, sha256 in rows}
 
     def save_estimate(self, estimator: str, alignment_json: str, clock: Clock) -> None:
         """Add an estimate to the run's history."""
@@ -293,7 +306,8 @@ class RunStore:
 
     def _record(self, row: Sequence[object], responses: NDArray[np.float64]) -> Record:
         index, label, *numbers, reason, detail = row
-        theta_x, theta_y, uncertainty, star, star_exposure, reflector_exposure = np.array(numbers, dtype=np.float64)
+        values = np.array(numbers, dtype=np.float64)
+        theta_x, theta_y, uncertainty, star, star_exposure, reflector_exposure, star_mid, reflector_mid = values
         try:
             reject_reason = None if reason is None else RejectReason(str(reason))
         except ValueError:
@@ -312,6 +326,8 @@ class RunStore:
             reflector_exposure_s=float(reflector_exposure),
             reject_reason=reject_reason,
             detail=str(detail),
+            star_mid_exposure_s=float(star_mid),
+            reflector_mid_exposure_s=float(reflector_mid),
         )
 
 
@@ -346,4 +362,6 @@ def _record_row(record: Record) -> tuple[object, ...]:
         float(record.reflector_exposure_s),
         None if record.reject_reason is None else record.reject_reason.value,
         record.detail,
+        float(record.star_mid_exposure_s),
+        float(record.reflector_mid_exposure_s),
     )

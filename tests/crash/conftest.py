@@ -1,4 +1,4 @@
-"""The folder of the original program that the unit tests of the store write serves here, too."""
+"""What the unit tests of store, cycle and imaging write and render serves here, too."""
 
 from __future__ import annotations
 
@@ -6,3 +6,5 @@ import sys
 from pathlib import Path
 
 sys.path.append(str(Path(__file__).parents[1] / "unit" / "store"))
+sys.path.append(str(Path(__file__).parents[1] / "unit" / "cycle"))
+sys.path.append(str(Path(__file__).parents[1] / "unit" / "imaging"))

@@ -193,6 +193,6 @@ def _print_summary(out: Path, summary: ImportSummary) -> None:
             console.print(f"    and {len(rejections) - N_NAMED_RECORDS} more")
     if summary.missing_facet_ids:
         ids = ", ".join(map(str, summary.missing_facet_ids))
-        console.print(f"  facets of the config without data: {ids}")
+        console.print(f"  facets of the config without data: ids {ids}")
     for remark in summary.remarks:
         console.print(f"  {escape(remark)}")

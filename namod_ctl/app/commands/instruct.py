@@ -28,7 +28,8 @@ from namod_ctl.core.errors import ConfigError, StoreError
 from namod_ctl.core.flags import FacetFlag
 from namod_ctl.optics.instrument import Instrument
 from namod_ctl.reconstruction.alignment import Alignment
-from namod_ctl.store.frames import write_file_durably
+from namod_ctl.store.frames import REFLECTOR_CAMERA
+from namod_ctl.store.results import write_results
 from namod_ctl.store.run import RunStore
 
 Image = NDArray[np.uint8]
@@ -53,7 +54,7 @@ def instruct(
     with RunStore.open(run) as store:
         instrument = build_instrument(InstrumentConfig.from_json(store.config_json, f"{run}: config"))
         alignment = read_alignment(run)
-        _refuse_unknown_facets(alignment, instrument, run)
+        _refuse_foreign_alignment(alignment, instrument, store.facet_ids, run)
         picture = read_picture(image) if image is not None else _picture_of_run(store)
     folder = out if out is not None else run
     if not folder.is_dir():
@@ -65,9 +66,12 @@ def instruct(
     except ConfigError as error:
         raise ConfigError(f"{image if image is not None else run}: {error}") from None
     n_bolts = max((len(facet.bolt_turn_deg) for facet in alignment.facets), default=0)
-    write_file_durably(folder / CSV_FILE, instructions_to_csv(instructions, n_bolts).encode())
-    write_file_durably(folder / PNG_FILE, png)
-    write_file_durably(folder / PDF_FILE, sheets_to_pdf(instrument, instructions, headline))
+    files = {
+        CSV_FILE: instructions_to_csv(instructions, n_bolts).encode(),
+        PNG_FILE: png,
+        PDF_FILE: sheets_to_pdf(instrument, instructions, headline),
+    }
+    write_results(folder, files)
     _report(alignment, instructions, folder)
 
 
@@ -89,7 +93,7 @@ def _picture_of_run(store: RunStore) -> Image | None:
     picture: Image | None = None
     for index, _ in labels[:: max(1, len(labels) // _MOST_FRAMES)]:
         try:
-            frame = store.frame(index, "reflector")
+            frame = store.frame(index, REFLECTOR_CAMERA)
         except StoreError:
             continue  # not kept, or damaged: another frame serves as well
         if frame.ndim == 2:
@@ -101,13 +105,18 @@ def _picture_of_run(store: RunStore) -> Image | None:
     return None if picture is None else np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
-def _refuse_unknown_facets(alignment: Alignment, instrument: Instrument, run: Path) -> None:
-    unknown = {facet.facet_id for facet in alignment.facets} - set(instrument.reflector.ids)
-    if unknown:
-        raise ConfigError(
-            f"{run}: alignment.json has facets {sorted(unknown)}, which the run's config does not know; "
-            f"run `namod-ctl reconstruct {run}` anew"
-        )
+def _refuse_foreign_alignment(
+    alignment: Alignment, instrument: Instrument, facet_ids: tuple[int, ...], run: Path
+) -> None:
+    """Raise ConfigError when the alignment is not this run's: other facets, facets twice, another telescope."""
+    found = [facet.facet_id for facet in alignment.facets]
+    if sorted(found) == sorted(facet_ids) and alignment.telescope == instrument.name:
+        return
+    odd = sorted(set(found) ^ set(facet_ids)) or "given twice"
+    raise ConfigError(
+        f"{run}: alignment.json (of {alignment.telescope}) does not belong to this run of {instrument.name}: facets "
+        f"{odd}; run `namod-ctl reconstruct {run}` anew"
+    )
 
 
 def _counts(instructions: tuple[FacetInstruction, ...]) -> str:
@@ -122,10 +131,18 @@ def _counts(instructions: tuple[FacetInstruction, ...]) -> str:
 
 
 def _headline(alignment: Alignment, run: Path, instructions: tuple[FacetInstruction, ...]) -> str:
-    return (
+    headline = (
         f"{alignment.telescope}, run {run.resolve().name}: {len(instructions)} facets, {_counts(instructions)} "
         f"(estimator {alignment.estimator}, {alignment.n_used} of {alignment.n_records} records)"
     )
+    doubtful = _resting_on_bad_records(alignment)
+    return f"{headline}. WRONG, rests on a bad record: {doubtful}" if doubtful else headline
+
+
+def _resting_on_bad_records(alignment: Alignment) -> str:
+    """Ids of the facets whose turns rest on a bad record, for people."""
+    flagged = (facet.facet_id for facet in alignment.facets if facet.flags & FacetFlag.RESTS_ON_BAD_RECORD)
+    return ", ".join(map(str, flagged))
 
 
 def _report(alignment: Alignment, instructions: tuple[FacetInstruction, ...], folder: Path) -> None:
@@ -135,14 +152,12 @@ def _report(alignment: Alignment, instructions: tuple[FacetInstruction, ...], fo
     for instruction in instructions:
         if instruction.verdict is Verdict.DO_NOT_TURN:
             typer.echo(f"Facet {instruction.facet_id}: do not turn: {'; '.join(instruction.reasons)}.")
-    doubtful = [facet.facet_id for facet in alignment.facets if facet.flags & FacetFlag.RESTS_ON_BAD_RECORD]
-    if doubtful:
-        ids = ", ".join(map(str, doubtful))
+    if doubtful := _resting_on_bad_records(alignment):
         typer.echo(
-            f"Estimator {alignment.estimator} does not leave out bad records: the turns of facets {ids} rest on one. "
-            "Turn by the default estimator instead: namod-ctl reconstruct without --estimator."
+            f"Estimator {alignment.estimator} does not leave out bad records: the turns of facets {doubtful} rest "
+            "on one. Turn by the default estimator instead: namod-ctl reconstruct without --estimator."
         )
     if alignment.facets_not_in_run:
         ids = ", ".join(map(str, alignment.facets_not_in_run))
-        typer.echo(f"Not in this run, so without an instruction: {ids}.")
+        typer.echo(f"Not in this run, so without an instruction: facet ids {ids}.")
     typer.echo(f"Written to {folder}: {CSV_FILE}, {PNG_FILE}, {PDF_FILE}.")

@@ -21,6 +21,7 @@ from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.flags import FacetFlag
 from namod_ctl.core.records import Record
 from namod_ctl.store.facet_lists import read_mars
+from namod_ctl.store.frames import REFLECTOR_CAMERA
 from namod_ctl.store.run import RunStore
 
 
@@ -142,7 +143,7 @@ def test_instruct_lays_the_runs_own_frames_over_each_other(run, fact, namod_ctl)
     with RunStore.open(run, read_only=False) as store:
         frame = np.zeros((camera.n_rows, camera.n_columns, 3), np.uint8)
         frame[:20, :20] = (0, 0, 200)  # OpenCV's order: red
-        store.add_frame(0, "reflector", frame)
+        store.add_frame(0, REFLECTOR_CAMERA, frame)
         store.append([record(0, len(store.facet_ids))])
     assert namod_ctl("instruct", run).returncode == 0
     corner = cv2.imread(str(run / "instructions.png"))[10, 10]
