@@ -3,8 +3,8 @@
 Run: python benchmarks/bench_estimators.py [folder of FACT response maps]
 
 The rival `gaussian (scipy)` is the ordinary answer: an elliptical gaussian with background per facet, scipy's
-least_squares with soft_l1 loss, started at the brightest record. Runs are made by the generator of the tests, which throws rays and
-shares no code with the estimators. Seeds are not those of the tests.
+least_squares with soft_l1 loss, started at the brightest record. Runs are made by the generator of the tests, which
+throws rays and shares no code with the estimators. Seeds are not those of the tests.
 """
 
 from __future__ import annotations

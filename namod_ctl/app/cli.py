@@ -16,6 +16,7 @@ from namod_ctl.core.errors import NamodError
 _COMMANDS = {
     "config": "namod_ctl.app.commands.config:app",
     "import": "namod_ctl.app.commands.imports:app",
+    "record": "namod_ctl.app.commands.record:record",
     "reconstruct": "namod_ctl.app.commands.reconstruct:reconstruct_run",
     "instruct": "namod_ctl.app.commands.instruct:instruct",
     "export": "namod_ctl.app.commands.export:export",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -11,6 +12,10 @@ from numpy.typing import NDArray
 from namod_ctl.core.records import Record
 
 Array = NDArray[np.float64]
+
+_VARIED = 1.2  # ratio of brightest to faintest star from which on the scene matters
+_SCENE_QUANTILE = 0.1  # a facet is unlit in far more records than these
+_MIN_FOR_SCENE = 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,11 +59,20 @@ class ResponseTable:
 
 
 def tabulate_responses(records: Iterable[Record], facet_ids: Sequence[int]) -> ResponseTable:
-    """Response table of the records that count; rejected ones are left out."""
+    """Response table of the records that count; rejected ones are left out.
+
+    An unlit facet still shows the faint scene around the telescope, which does not fade with the star. Where the star's
+    brightness varied over the run (clouds, zenith distance, another star), the scene of each facet, its dim
+    records' intensity, is therefore taken off before the intensity is divided by that of the star.
+    """
     accepted = [record for record in records if record.reject_reason is None]
     n = len(accepted)
     intensity = np.array([record.facet_intensity for record in accepted], dtype=np.float64).reshape(n, len(facet_ids))
     star = np.array([record.star_intensity for record in accepted], dtype=np.float64)
+    if n >= _MIN_FOR_SCENE and star.max() > _VARIED * star.min():
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # a facet that was never measured stays NaN
+            intensity = intensity - np.nanquantile(intensity, _SCENE_QUANTILE, axis=0)
     return ResponseTable(
         tuple(facet_ids),
         np.array([record.index for record in accepted], dtype=np.int64),

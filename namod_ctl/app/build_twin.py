@@ -1,0 +1,133 @@
+"""The twin of the telescope that a config describes."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import TypeAdapter, ValidationError
+
+from namod_ctl.app.build import build_instrument
+from namod_ctl.app.config import InstrumentConfig
+from namod_ctl.core.errors import ConfigError
+from namod_ctl.core.units import arcmin_to_rad, arcsec_to_rad, deg_to_rad
+from namod_ctl.optics.camera_model import CameraModel
+from namod_ctl.optics.instrument import Instrument
+from namod_ctl.optics.reflector import Reflector
+from namod_ctl.store.table_text import read_text
+from namod_ctl.twin.faults import FaultPlan
+from namod_ctl.twin.settings import REFLECTOR_CAMERA, STAR_CAMERA, TwinSettings
+from namod_ctl.twin.surface_map import projected_outlines
+from namod_ctl.twin.twin import Twin
+
+IMAGE_MARGIN_SHARE = 0.02
+"""Of the image's width: a lens is chosen so that the dish leaves that much free."""
+
+ANGLES: Mapping[str, Callable[[float], float]] = {
+    "deg": deg_to_rad,
+    "arcmin": arcmin_to_rad,
+    "arcsec": arcsec_to_rad,
+}
+POSITIVE = ("spacing_rad", "speed_rad_per_s", "exposure_at_mag0_s", "electrons_per_adu", "exposure_step_s")
+
+
+def load_twin_settings(path: str | Path) -> TwinSettings:
+    """Settings from a TOML file with the keys of `TwinSettings`; what is not given keeps its default.
+
+    Angles may be given in other units than rad: `misalignment_arcmin = 4.0`, `speed_arcmin_per_s = 1.0`. Faults are
+    `[[faults]]` with `name`, `start_s`, `duration_s` and `params`.
+
+    Raises
+    ------
+    ConfigError
+        All wrong keys and values together.
+    """
+    try:
+        raw = tomllib.loads(read_text(Path(path)))
+    except ValueError as error:
+        raise ConfigError(f"{path}: not valid TOML: {error}") from None
+    problems: list[str] = []
+    raw = _in_radians(raw, str(path), problems)
+    for camera, default in (("star_camera", STAR_CAMERA), ("reflector_camera", REFLECTOR_CAMERA)):
+        if isinstance(raw.get(camera), dict):  # these two have defaults of their own
+            own = {"exposure_at_mag0_s": default.exposure_at_mag0_s, "background_share": default.background_share}
+            raw[camera] = own | raw[camera]
+    try:
+        settings = TypeAdapter(TwinSettings).validate_python(raw)
+    except ValidationError as error:
+        problems += [
+            f"{path}: {'.'.join(map(str, detail['loc']))} = {detail['input']!r}: {detail['msg']}"
+            for detail in error.errors()
+        ]
+        raise ConfigError("\n".join(problems)) from None
+    plan = FaultPlan()
+    for number, fault in enumerate(settings.faults):
+        try:
+            plan.inject(fault)
+        except ConfigError as problem:
+            problems.append(f"{path}: faults.{number}: {problem}")
+    if problems:
+        raise ConfigError("\n".join(problems))
+    return settings
+
+
+def _in_radians(section: Mapping[str, Any], where: str, problems: list[str]) -> dict[str, Any]:
+    """The section with its angles in rad; values that must be positive and are not go into `problems`."""
+    converted: dict[str, Any] = {}
+    for key, value in section.items():
+        name, new = key, value
+        if isinstance(value, dict):
+            new = _in_radians(value, f"{where}: {key}", problems)
+        elif isinstance(value, list):
+            new = [_in_radians(v, f"{where}: {key}", problems) if isinstance(v, dict) else v for v in value]
+        words = key.split("_")
+        for unit in ANGLES.keys() & set(words[1:]):
+            name = "_".join("rad" if word == unit else word for word in words)
+            numbers = new if isinstance(new, list) else [new]
+            if all(isinstance(number, int | float) for number in numbers):
+                angles = [ANGLES[unit](float(number)) for number in numbers]
+                new = angles if isinstance(new, list) else angles[0]
+        if name in POSITIVE and isinstance(value, int | float) and not value > 0.0:
+            problems.append(f"{where}: {key} = {value!r}: must be positive")
+        converted[name] = new
+    return converted
+
+
+def build_twin(config: InstrumentConfig, settings: TwinSettings, seed: int) -> Twin:
+    """The twin of that config; `twin.instrument` has a map of facets even where the config has none.
+
+    Raises
+    ------
+    ConfigError
+        For a star, a fault or a parameter in the settings that does not exist.
+    """
+    return Twin(with_facet_map(build_instrument(config)), settings, seed)
+
+
+def with_facet_map(instrument: Instrument) -> Instrument:
+    """The instrument itself if it has a map of facets, else one with the map that `project_polygons` makes."""
+    if instrument.facet_polygons_px:
+        return instrument
+    polygons_px = project_polygons(instrument.reflector, instrument.reflector_camera)
+    return replace(instrument, facet_polygons_px=polygons_px)
+
+
+def project_polygons(reflector: Reflector, camera: CameraModel) -> dict[int, NDArray[np.float64]]:
+    """Outlines of all facets, by id, shape (n_corners, 2), as a pinhole camera in the focal point sees them.
+
+    Where the dish does not fit into the image, the camera is taken to have a lens of shorter focal length that shows
+    all of it: nothing that is measured depends on the reflector camera's plate scale.
+    """
+    outlines = projected_outlines(reflector, camera)
+    offsets = np.concatenate(outlines) - camera.axis_pixel
+    room = np.array([camera.n_columns, camera.n_rows]) / 2.0 - IMAGE_MARGIN_SHARE * camera.n_columns
+    shrink = min(1.0, float(np.min(room / np.abs(offsets).max(axis=0))))
+    return {
+        facet.id: camera.axis_pixel + shrink * (outline - camera.axis_pixel)
+        for facet, outline in zip(reflector.facets, outlines, strict=True)
+    }

@@ -1,0 +1,225 @@
+"""`namod-ctl record`: image pairs become a run, live."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import signal
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from namod_ctl.app.build import build_instrument
+from namod_ctl.app.build_twin import build_twin, with_facet_map
+from namod_ctl.app.config import InstrumentConfig, load_config
+from namod_ctl.app.terminal import TerminalView
+from namod_ctl.core.clock import SystemClock
+from namod_ctl.core.errors import ConfigError
+from namod_ctl.core.flags import REJECT_REASON_MEANING
+from namod_ctl.core.units import arcmin_to_rad, deg_to_rad
+from namod_ctl.cycle.live_estimate import LiveEstimator
+from namod_ctl.cycle.progress import Progress
+from namod_ctl.cycle.record import SESSION_GAP_S, Equipment, Recorder, RecordSettings, StopRule
+from namod_ctl.cycle.replay import CAMERAS, ReplayCamera, ReplayClock, replayable_records
+from namod_ctl.optics.instrument import Instrument
+from namod_ctl.store.import_namod import KeepFrames
+from namod_ctl.store.run import RunStore
+from namod_ctl.twin.settings import TwinSettings
+
+DEFAULT_N_RECORDS = 1300  # of FACT's night (arXiv:1605.06274, section 4)
+EXIT_INTERRUPTED = 130  # what shells report for a program that was ended by Ctrl-C
+NOTE_TWIN_SEED = "record.twin_seed"
+DEFAULT_SEED = 1
+
+_ANGLE = re.compile(r"([0-9]*\.?[0-9]+)\s*(arcmin|deg)")
+
+
+@dataclass(frozen=True, slots=True)
+class _Session:
+    """What is recorded with, and into what."""
+
+    equipment: Equipment
+    instrument: Instrument
+    store: RunStore
+    pass_s: float
+    replayed: Iterator[tuple[int, str]] | None = None
+
+
+def record(
+    out: Annotated[Path | None, typer.Option("--out", help="Folder of the new run; must not exist yet.")] = None,
+    config: Annotated[
+        str | None, typer.Option("--config", help="Instrument: a TOML file, or a built-in name.  [default: fact]")
+    ] = None,
+    append: Annotated[Path | None, typer.Option("--append", metavar="RUN", help="Go on with this run.")] = None,
+    replay: Annotated[
+        Path | None, typer.Option("--replay", metavar="RUN", help="Record the frames kept in this run anew, to --out.")
+    ] = None,
+    records: Annotated[
+        int | None,
+        typer.Option(min=1, help="Stop when so many records of the run count.  [default: 1300 if nothing else stops]"),
+    ] = None,
+    minutes: Annotated[float | None, typer.Option(min=0.0, help="Stop after this time.")] = None,
+    until_uncertainty: Annotated[
+        str | None, typer.Option(help="Stop when every facet is known to this, such as 0.3arcmin.")
+    ] = None,
+    keep_frames: Annotated[KeepFrames, typer.Option(help="Frames to keep in the run.")] = KeepFrames.NONE,
+    every: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SECONDS",
+            min=0.0,
+            help="Start a pair this long after the one before.  [default: at once; on the twin with --records, so "
+            "that they fill one pass over the region]",
+        ),
+    ] = None,
+    region_radius_deg: Annotated[
+        float, typer.Option(min=0.01, max=5.0, help="Of the directions that are to be covered.")
+    ] = 0.35,
+    twin: Annotated[
+        bool, typer.Option("--twin", help="Record the digital twin, in its own time, as fast as the computer can.")
+    ] = False,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of the twin: another seed is another telescope.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace an older run at --out, at once.")] = False,
+) -> None:
+    """Record image pairs of a star and of the reflector into a run.
+
+    Ctrl-C stops after the record in work; a second one stops at once, and the run keeps all records before it.
+
+    Example: namod-ctl record --twin --out RUN --records 300
+    """
+    stop = _stop_rule(records, minutes, until_uncertainty, is_replay=replay is not None)
+    console = Console(stderr=True, highlight=False)
+    with ExitStack() as stack:
+        if replay is not None:
+            if append is not None or config is not None or seed is not None or twin or every is not None:
+                raise ConfigError("--replay takes everything from its run: give it --out and nothing else of the night")
+            session = _replay(stack, replay, out, force=force)
+            title = f"replay of {replay}"
+        else:
+            session = _record_twin(stack, out, append, config, seed, force=force)
+            title = f"twin of {session.instrument.name}"
+            if not twin:
+                console.print(
+                    "There are no drivers for cameras yet: this records the digital twin, not a sky (--twin says so)."
+                )
+        pace_s = every or 0.0
+        if every is None and stop.n_records is not None:
+            pace_s = session.pass_s / stop.n_records
+        settings = RecordSettings(
+            keep_frames=keep_frames is KeepFrames.ALL, region_radius_rad=deg_to_rad(region_radius_deg), pace_s=pace_s
+        )
+        estimator = None
+        if replay is None:
+            estimator = LiveEstimator(session.store.path, session.instrument)
+            stack.callback(estimator.close)
+        recorder = Recorder(session.equipment, session.instrument, session.store, settings, estimator, session.replayed)
+        with TerminalView(console, title) as view, _stopped_by_ctrl_c(recorder, console):
+            reason = recorder.record(stop, view.show)
+            progress = recorder.progress()
+            view.show(progress, now=True)
+        _print_summary(session.store.path, reason, progress, recorder.events)
+
+
+def _stop_rule(records: int | None, minutes: float | None, until: str | None, *, is_replay: bool) -> StopRule:
+    if records is None and minutes is None and until is None and not is_replay:
+        records = DEFAULT_N_RECORDS
+    return StopRule(
+        n_records=records,
+        duration_s=None if minutes is None else 60.0 * minutes,
+        uncertainty_rad=None if until is None else _angle_rad(until),
+    )
+
+
+def _angle_rad(text: str) -> float:
+    match = _ANGLE.fullmatch(text.strip())
+    if match is None or float(match[1]) <= 0.0:
+        raise ConfigError(f"--until-uncertainty {text}: give a positive angle with its unit, such as 0.3arcmin")
+    return arcmin_to_rad(float(match[1])) if match[2] == "arcmin" else deg_to_rad(float(match[1]))
+
+
+def _record_twin(
+    stack: ExitStack, out: Path | None, append: Path | None, config: str | None, seed: int | None, *, force: bool
+) -> _Session:
+    if (out is None) == (append is None):
+        raise ConfigError("say where the records go: --out for a new run, or --append RUN to go on with one")
+    if append is not None:
+        store = stack.enter_context(RunStore.open(append, read_only=False))
+        noted = store.note(NOTE_TWIN_SEED)
+        if noted is None:
+            raise ConfigError(f"{append}: was not recorded with the twin, so the twin cannot go on with it; use --out")
+        if seed is not None and seed != int(noted):
+            raise ConfigError(f"{append}: was recorded with --seed {noted}, another seed is another telescope")
+        if config is not None and load_config(config).to_json() != store.config_json:
+            raise ConfigError(f"{append}: was recorded with another config; leave --config out to go on with its own")
+        used = InstrumentConfig.from_json(store.config_json, f"{append}: config")
+        twin = build_twin(used, TwinSettings(), int(noted))
+        times_s = [r.star_mid_exposure_s for r in store.records() if math.isfinite(r.star_mid_exposure_s)]
+        twin.update(max(times_s, default=0.0) + SESSION_GAP_S)
+    else:
+        assert out is not None
+        used = load_config(config or "fact")
+        chosen = DEFAULT_SEED if seed is None else seed
+        twin = build_twin(used, TwinSettings(), chosen)
+        source = f"digital twin of {used.telescope.name}, seed {chosen}"
+        facet_ids = [facet.id for facet in used.facets]
+        store = stack.enter_context(RunStore.create(out, facet_ids, used.to_json(), source, twin.wall_clock, force))
+        store.set_note(NOTE_TWIN_SEED, str(chosen))
+    equipment = Equipment(twin.star_camera, twin.reflector_camera, twin.clock, twin.wall_clock)
+    return _Session(equipment, twin.instrument, store, twin.telescope.pass_s)
+
+
+def _replay(stack: ExitStack, replay: Path, out: Path | None, *, force: bool) -> _Session:
+    if out is None:
+        raise ConfigError("--replay RUN needs --out for the new run: the old one stays as it is")
+    if out.resolve() == replay.resolve():
+        raise ConfigError(f"--out {out}: is the run that is replayed, which stays as it is; choose another")
+    with RunStore.open(replay) as old:
+        found = replayable_records(old)
+        star, reflector = (ReplayCamera(old, found, camera) for camera in CAMERAS)
+        instrument = with_facet_map(build_instrument(InstrumentConfig.from_json(old.config_json, f"{replay}: config")))
+        store = RunStore.create(out, old.facet_ids, old.config_json, f"replay of {old.path}", SystemClock(), force)
+    stack.enter_context(store)
+    identities = iter([(record.index, record.label) for record in found])
+    equipment = Equipment(star, reflector, ReplayClock(), SystemClock())
+    return _Session(equipment, instrument, store, 0.0, identities)
+
+
+@contextmanager
+def _stopped_by_ctrl_c(recorder: Recorder, console: Console) -> Iterator[None]:
+    """The first Ctrl-C asks the recorder to stop, the second ends the program there and then."""
+
+    def stop_now(number: int, frame: FrameType | None) -> None:
+        # threads that wait for a camera would hold up an orderly end; what is committed is safe on the disk
+        console.show_cursor(True)
+        os._exit(EXIT_INTERRUPTED)
+
+    def ask_to_stop(number: int, frame: FrameType | None) -> None:
+        recorder.ask_to_stop()
+        signal.signal(signal.SIGINT, stop_now)
+
+    before = signal.signal(signal.SIGINT, ask_to_stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _print_summary(path: Path, reason: str, progress: Progress, events: list[str]) -> None:
+    console = Console(soft_wrap=True, highlight=False)
+    n_rejected = sum(progress.rejected.values())
+    console.print(f"{path}: {reason}; {progress.n_accepted} records count, {n_rejected} rejected", markup=False)
+    for rejection, n in progress.rejected.items():
+        console.print(f"  {n} {rejection.name}: {REJECT_REASON_MEANING[rejection]}", markup=False)
+    for cause, n in progress.source.dropped.items():
+        console.print(f"  {n} pairs retaken: {cause.value}", markup=False)
+    if progress.source.n_frames_missed:
+        console.print(f"  {progress.source.n_frames_missed} frames were counted by a camera but never came")
+    for event in events:
+        console.print(f"  {event}", markup=False)

@@ -1,0 +1,293 @@
+"""Image pairs of two cameras that expose at the same time, one after the other without a pause.
+
+Each camera has a worker thread. The star camera's also keeps the two in step: it starts both exposures so that their
+middles coincide, gathers both frames, judges their exposures, and takes the pair again when one is too bright or too
+dark. It works ahead of whoever uses the pairs by at most `PAIRS_AHEAD`, so the next exposure runs while a pair is
+being reduced, and memory stays as it is when the reduction is slower.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections import Counter, deque
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from datetime import datetime
+from enum import StrEnum
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from namod_ctl.core.clock import Clock
+from namod_ctl.core.errors import CommunicationError, DeviceFaultError
+from namod_ctl.core.interfaces import Camera, Exposure, MonotonicClock
+from namod_ctl.imaging.exposure import (
+    ExposureRule,
+    ExposureVerdict,
+    frame_statistics,
+    judge_exposure,
+    next_exposure_s,
+)
+from namod_ctl.imaging.radiometry import Frame
+from namod_ctl.optics.camera_model import CameraModel
+
+PAIRS_AHEAD = 3
+"""Pairs that are kept or being made at a time: one to take, one to wait, one to expose; 7.3 MB each at FACT."""
+
+LOST_CAMERA_RETRY_S = 1.0
+
+TORN_ROWS = 4
+"""A camera that shows noise in every row but so many at the end has lost them on the way."""
+
+
+class DropCause(StrEnum):
+    """Why an image pair was dropped and taken again; the value is what a person reads."""
+
+    STAR_SATURATED = "star frame saturated"
+    STAR_STARVED = "star frame too dark"
+    REFLECTOR_SATURATED = "reflector frame saturated"
+    REFLECTOR_STARVED = "reflector frame too dark"
+    NO_FRAME = "frame lost or torn"
+    STALE_FRAME = "the same frame twice"
+    CAMERA_LOST = "camera lost"
+
+
+_VERDICT_CAUSE = {
+    ("star", ExposureVerdict.SATURATED): DropCause.STAR_SATURATED,
+    ("star", ExposureVerdict.STARVED): DropCause.STAR_STARVED,
+    ("reflector", ExposureVerdict.SATURATED): DropCause.REFLECTOR_SATURATED,
+    ("reflector", ExposureVerdict.STARVED): DropCause.REFLECTOR_STARVED,
+}
+
+
+class SourceExhaustedError(Exception):
+    """A camera of stored frames has shown its last one."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pair:
+    """Two exposures made at the same time, and the time of day when they were done."""
+
+    star: Exposure
+    reflector: Exposure
+    done: datetime
+
+
+@dataclass(frozen=True, slots=True)
+class SourceStatus:
+    """How the cameras are doing.
+
+    Attributes
+    ----------
+    dropped
+        Pairs that were dropped, by cause, in the order of the causes.
+    n_frames_missed
+        Frames that a camera counted but never delivered.
+    trouble
+        What is wrong at this moment, for a person; empty when nothing is.
+    """
+
+    dropped: dict[DropCause, int]
+    n_frames_missed: int
+    trouble: str
+
+
+class CameraLine:
+    """One camera with its exposure law.
+
+    Parameters
+    ----------
+    role
+        "star" or "reflector".
+    region
+        Where light matters in its frames, see `imaging.exposure.frame_statistics`.
+    """
+
+    def __init__(
+        self,
+        role: str,
+        camera: Camera,
+        model: CameraModel,
+        rule: ExposureRule,
+        first_exposure_s: float,
+        region: NDArray[np.uint8] | None = None,
+    ) -> None:
+        self.role = role
+        self.camera = camera
+        self.exposure_s = rule.clipped(first_exposure_s)
+        self.n_frames_missed = 0
+        self._model, self._rule, self._limited, self._region = model, rule, rule, region
+        self._last_frame_id: int | None = None
+
+    def limit(self, longest_s: float) -> None:
+        """From now on expose no longer than `longest_s`, nor longer than the rule says."""
+        longest_s = min(max(longest_s, self._rule.shortest_s), self._rule.longest_s)
+        self._limited = replace(self._rule, longest_s=longest_s)
+        self.exposure_s = self._limited.clipped(self.exposure_s)
+
+    def finish(self, timeout_s: float) -> tuple[Exposure | None, DropCause | None, str]:
+        """The exposure begun last, why it is to be dropped (None if it is good), and that in words.
+
+        Sets `exposure_s` for the next one.
+        """
+        try:
+            exposure = self.camera.fetch(timeout_s)
+        except CommunicationError as error:
+            return None, DropCause.NO_FRAME, str(error)
+        except DeviceFaultError as error:
+            return None, DropCause.CAMERA_LOST, str(error)
+        if exposure.frame_id == self._last_frame_id:
+            detail = f"{self.camera.name}: frame {exposure.frame_id} came twice"
+            return None, DropCause.STALE_FRAME, detail
+        if self._last_frame_id is not None:
+            self.n_frames_missed += max(0, exposure.frame_id - self._last_frame_id - 1)
+        self._last_frame_id = exposure.frame_id
+        if _is_torn(exposure.image):
+            return None, DropCause.NO_FRAME, f"{self.camera.name}: frame {exposure.frame_id} arrived incomplete"
+        statistics = frame_statistics(exposure.image, self._model, self._region)
+        verdict = judge_exposure(statistics, exposure.exposure_s, self._limited)
+        self.exposure_s = next_exposure_s(statistics, exposure.exposure_s, self._limited)
+        detail = f"{self.camera.name}: {verdict} at {exposure.exposure_s:.4g} s"
+        return exposure, _VERDICT_CAUSE.get((self.role, verdict)), detail
+
+
+class PairSource:
+    """Takes pairs from `__enter__` on until it is closed.
+
+    Parameters
+    ----------
+    max_retakes
+        So often a pair is taken again for its exposure; then it is delivered as it is, for the measurement to judge.
+    timeout_s
+        How long after its exposure a frame is waited for.
+    pace_s
+        From the start of one pair to that of the next, at least.
+    """
+
+    def __init__(
+        self,
+        star: CameraLine,
+        reflector: CameraLine,
+        clock: MonotonicClock,
+        wall_clock: Clock,
+        max_retakes: int,
+        timeout_s: float,
+        pace_s: float = 0.0,
+    ) -> None:
+        self._star, self._reflector = star, reflector
+        self._clock, self._wall_clock = clock, wall_clock
+        self._max_retakes, self._timeout_s, self._pace_s = max_retakes, timeout_s, pace_s
+        self._next_start_s = clock.monotonic_s()
+        self._star_worker = ThreadPoolExecutor(1, "star_camera")
+        self._reflector_worker = ThreadPoolExecutor(1, "reflector_camera")
+        self._in_flight: deque[Future[Pair | None]] = deque()
+        self._is_closing = threading.Event()
+        self._lock = threading.Lock()
+        self._dropped: Counter[DropCause] = Counter()
+        self._trouble = ""
+
+    def __enter__(self) -> Self:
+        for _ in range(PAIRS_AHEAD):
+            self._in_flight.append(self._star_worker.submit(self._take, math.inf))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._is_closing.set()
+        self._star_worker.shutdown(wait=False, cancel_futures=True)
+        for line in (self._star, self._reflector):
+            line.camera.close()  # aborts what is being exposed
+        self._star_worker.shutdown()
+        self._reflector_worker.shutdown()
+
+    def next(self, timeout_s: float, longest_s: float = math.inf) -> Pair | None:
+        """The next pair; None when it has not come within `timeout_s`.
+
+        The pair that is begun in its place is exposed for `longest_s` at most. So what limits a pair is known of those
+        `PAIRS_AHEAD` before it, however fast they are reduced: a twin's recording can be repeated.
+
+        Raises
+        ------
+        SourceExhaustedError
+            There are no more.
+        """
+        try:
+            pair = self._in_flight[0].result(timeout_s)
+        except TimeoutError:
+            return None
+        self._in_flight.popleft()
+        self._in_flight.append(self._star_worker.submit(self._take, longest_s))
+        return pair
+
+    @property
+    def status(self) -> SourceStatus:
+        """How the cameras are doing at this moment."""
+        with self._lock:
+            dropped = {cause: self._dropped[cause] for cause in DropCause if self._dropped[cause]}
+            missed = self._star.n_frames_missed + self._reflector.n_frames_missed
+            return SourceStatus(dropped, missed, self._trouble)
+
+    def _take(self, longest_s: float) -> Pair | None:
+        """The next pair that is good; None when the source is being closed. Runs in the star camera's thread."""
+        n_retakes = 0
+        self._star.limit(longest_s)
+        self._reflector.limit(longest_s)
+        early_s = self._next_start_s - self._clock.monotonic_s()
+        if early_s > 0.0 and not self._is_closing.is_set():
+            self._clock.wait_s(early_s)
+        self._next_start_s = max(self._next_start_s, self._clock.monotonic_s()) + self._pace_s
+        while not self._is_closing.is_set():
+            if not self._start_both():
+                self._clock.wait_s(LOST_CAMERA_RETRY_S)
+                continue
+            reflector_done = self._reflector_worker.submit(self._reflector.finish, self._timeout_s)
+            star, star_cause, star_detail = self._star.finish(self._timeout_s)
+            reflector, reflector_cause, reflector_detail = reflector_done.result()
+            causes = [cause for cause in (star_cause, reflector_cause) if cause is not None]
+            is_complete = star is not None and reflector is not None
+            if star is not None and reflector is not None and (not causes or n_retakes >= self._max_retakes):
+                self._note((), "")
+                return Pair(star, reflector, self._wall_clock.now())
+            details = [d for d, c in ((star_detail, star_cause), (reflector_detail, reflector_cause)) if c is not None]
+            self._note(causes, "; ".join(details))
+            n_retakes += is_complete
+            if DropCause.CAMERA_LOST in causes:
+                self._clock.wait_s(LOST_CAMERA_RETRY_S)
+        return None
+
+    def _start_both(self) -> bool:
+        """Start both exposures, the longer first and the shorter in its middle; False when a camera is lost."""
+        first, second = sorted((self._reflector, self._star), key=lambda line: -line.exposure_s)
+        lead_s = 0.5 * (first.exposure_s - second.exposure_s)
+        for line in (first, second):
+            if line is second and lead_s > 0.0:
+                self._clock.wait_s(lead_s)
+            try:
+                line.camera.start(line.exposure_s)
+            except DeviceFaultError as error:
+                self._note((DropCause.CAMERA_LOST,), str(error))
+                if line is second:
+                    first.finish(self._timeout_s)
+                return False
+        return True
+
+    def _note(self, causes: tuple[DropCause, ...] | list[DropCause], trouble: str) -> None:
+        if self._is_closing.is_set():  # a camera that is closed delivers nothing, and that is no news
+            return
+        with self._lock:
+            self._dropped.update(causes)
+            self._trouble = trouble
+
+
+def _is_torn(image: Frame) -> bool:
+    """True when the lower part of a frame never arrived: nothing but zeros, below rows that all show noise."""
+    if image[-1].any():
+        return False
+    has_light: NDArray[np.bool_] = np.asarray(image.reshape(len(image), -1).any(axis=1))
+    n_arrived = len(image) - int(np.argmax(has_light[::-1])) if has_light.any() else 0
+    n_missing = len(image) - n_arrived
+    return n_missing >= TORN_ROWS and bool(has_light[:n_arrived].all())

@@ -1,0 +1,398 @@
+"""The recorder: image pairs become records of a run, one after the other, until enough of them count.
+
+The cameras' threads (`pairs`) expose; this thread measures the pair before, stores it, and tells the crew. It is the
+same path for the sky, the twin and stored frames (`replay`).
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import math
+import sqlite3
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from namod_ctl.core.clock import Clock
+from namod_ctl.core.errors import ConfigError, StoreError
+from namod_ctl.core.flags import RejectReason
+from namod_ctl.core.interfaces import Camera, MonotonicClock
+from namod_ctl.core.records import Record
+from namod_ctl.core.units import deg_to_rad, rad_to_deg
+from namod_ctl.cycle.live_estimate import LiveEstimator
+from namod_ctl.cycle.pairs import CameraLine, Pair, PairSource, SourceExhaustedError
+from namod_ctl.cycle.progress import Progress, Tracker
+from namod_ctl.imaging.exposure import exposure_rule
+from namod_ctl.imaging.facets import FacetPhotometer
+from namod_ctl.imaging.measure import measure_record
+from namod_ctl.optics.camera_model import CameraModel
+from namod_ctl.optics.instrument import Instrument
+from namod_ctl.store.run import RunStore
+
+NOTE_SESSIONS = "record.sessions"
+
+POLL_S = 0.2
+"""How long a pair is waited for before the crew's display is refreshed."""
+
+MIN_RECORDS_FOR_UNCERTAINTY = 100
+MIN_COVERAGE_FOR_UNCERTAINTY = 0.8
+"""With fewer records, or emptier regions, the facets that are known worst are those not seen at all."""
+
+N_SPEEDS = 5
+"""The telescope's speed is the median of so many: one jump, or one wrong star, does not count."""
+
+MAX_SPEED_BASE_S = 10.0
+"""Between records further apart than this the telescope may have gone anywhere: its speed is not known."""
+
+MOTION_MARGIN = 0.8
+"""Of the longest exposure that the telescope's motion allows: it may quicken a little."""
+
+CLOCK_STEP = timedelta(seconds=1)
+SESSION_GAP_S = 60.0
+"""Between two sessions of a run, in its own time: more than lies between two records."""
+
+_DISK_ERRNOS = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.ENOENT, errno.ESTALE)
+_DISK_CODES = (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_BUSY, sqlite3.SQLITE_CANTOPEN)
+
+
+@dataclass(frozen=True, slots=True)
+class RecordSettings:
+    """What the crew may choose.
+
+    Attributes
+    ----------
+    target_share
+        Share of full scale at which each camera's brightest pixel is kept.
+    shortest_s, longest_s
+        Limits of the exposures; the cameras may have tighter ones.
+    max_retakes
+        So often a pair is taken again for its exposures.
+    max_motion_share
+        Of a star's image: a telescope that moves further during the longer exposure spoils the record. Half of it
+        widens a facet's point spread function by 1 % at FACT.
+    pace_s
+        From one pair to the next, at least: a telescope that wanders slowly is not recorded at every step.
+    keep_frames
+        Keep the frames of every record.
+    region_radius_rad
+        Of the directions that are to be covered.
+    store_retry_s
+        A full disk is tried again after this time.
+    """
+
+    target_share: float = 0.8
+    shortest_s: float = 1e-3
+    longest_s: float = 3.0
+    first_exposure_s: float = 0.1
+    max_retakes: int = 3
+    max_motion_share: float = 0.5
+    fetch_timeout_s: float = 2.0
+    pace_s: float = 0.0
+    keep_frames: bool = False
+    region_radius_rad: float = deg_to_rad(0.35)
+    store_retry_s: float = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class StopRule:
+    """What ends a recording, whichever comes first; None for what does not.
+
+    Attributes
+    ----------
+    n_records
+        Records that count, in the whole run.
+    duration_s
+        Of this session, on the cameras' clock.
+    uncertainty_rad
+        Of the facet that is known worst.
+    """
+
+    n_records: int | None = None
+    duration_s: float | None = None
+    uncertainty_rad: float | None = None
+
+    def reason_to_stop(self, progress: Progress) -> str:
+        """Why the recording is complete, for a person; empty while it is not."""
+        estimate = progress.estimate
+        if self.n_records is not None and progress.n_accepted >= self.n_records:
+            return f"{progress.n_accepted} records count"
+        if self.duration_s is not None and progress.elapsed_s >= self.duration_s:
+            return f"{progress.elapsed_s / 60.0:.1f} minutes are over"
+        if (
+            self.uncertainty_rad is not None
+            and estimate is not None
+            and estimate.n_records >= MIN_RECORDS_FOR_UNCERTAINTY
+            and progress.coverage.share >= MIN_COVERAGE_FOR_UNCERTAINTY
+            and estimate.worst_uncertainty_rad <= self.uncertainty_rad
+        ):
+            return "every facet is known well enough"
+        return ""
+
+
+@dataclass(frozen=True, slots=True)
+class Equipment:
+    """What a recording works with.
+
+    Attributes
+    ----------
+    clock
+        The cameras' time.
+    wall_clock
+        Time of day, for labels only.
+    """
+
+    star_camera: Camera
+    reflector_camera: Camera
+    clock: MonotonicClock
+    wall_clock: Clock
+
+
+class Recorder:
+    """Records into a run.
+
+    Parameters
+    ----------
+    estimator
+        For the live estimate; None does without.
+    replayed
+        Index and label of the records whose frames the cameras replay; None records anew.
+
+    Raises
+    ------
+    ConfigError
+        A facet of the run has no polygon in the instrument, or an exposure wish cannot be met.
+    """
+
+    def __init__(
+        self,
+        equipment: Equipment,
+        instrument: Instrument,
+        store: RunStore,
+        settings: RecordSettings,
+        estimator: LiveEstimator | None = None,
+        replayed: Iterator[tuple[int, str]] | None = None,
+    ) -> None:
+        self._equipment, self._instrument, self._store = equipment, instrument, store
+        self._settings, self._estimator, self._replayed = settings, estimator, replayed
+        camera = instrument.reflector_camera
+        self._photometer = FacetPhotometer(
+            instrument.facet_polygons_px, store.facet_ids, camera.n_columns, camera.n_rows
+        )
+        earlier = store.records()
+        self._next_index = earlier[-1].index + 1 if earlier else 0
+        self._before = next((record for record in reversed(earlier) if np.isfinite(record.theta_rad).all()), None)
+        now_s = equipment.clock.monotonic_s()
+        times_s = [record.star_mid_exposure_s for record in earlier if np.isfinite(record.star_mid_exposure_s)]
+        # A run's time begins with its first session and only ever grows; a replay has it already.
+        self._offset_s = (max(times_s) + SESSION_GAP_S if times_s else 0.0) - now_s if replayed is None else 0.0
+        self._tracker = Tracker(settings.region_radius_rad, now_s)
+        for record in earlier:
+            self._tracker.add_earlier(record)
+        self._source = PairSource(
+            self._line("star", equipment.star_camera, instrument.star_camera),
+            self._line("reflector", equipment.reflector_camera, camera, self._facet_region()),
+            equipment.clock,
+            equipment.wall_clock,
+            settings.max_retakes if replayed is None else 0,
+            settings.fetch_timeout_s,
+            settings.pace_s if replayed is None else 0.0,
+        )
+        self._speeds: deque[float] = deque(maxlen=N_SPEEDS)
+        self._is_asked_to_stop = threading.Event()
+        self._last_wall: datetime | None = None
+        self.events: list[str] = []
+        """What befell the recording besides rejected records, one sentence each."""
+
+    def ask_to_stop(self) -> None:
+        """Stop at the next record's boundary; may be called from a signal handler."""
+        self._is_asked_to_stop.set()
+
+    def record(self, stop: StopRule, on_progress: Callable[[Progress], None] = lambda progress: None) -> str:
+        """Record until a rule of `stop` is met or somebody asks to stop; the reason why it ended.
+
+        Raises
+        ------
+        StoreError
+            The run cannot be written for a reason that waiting does not mend.
+        ConfigError
+            The frames are not of the instrument's cameras.
+        """
+        self._tracker.n_wanted = stop.n_records
+        reason = ""
+        try:
+            with self._source:
+                while not reason:
+                    if self._is_asked_to_stop.is_set():
+                        reason = "stopped by hand"
+                        break
+                    pair = self._source.next(POLL_S, self._longest_exposure_s())
+                    if pair is not None:
+                        record = self._measured(pair)
+                        if not self._store_patiently(record, pair, on_progress):
+                            reason = "stopped by hand; the last record could not be stored"
+                            break
+                        now_s = self._equipment.clock.monotonic_s()
+                        self._tracker.add(record, now_s, self._source.status)
+                    progress = self.progress()
+                    on_progress(progress)
+                    reason = stop.reason_to_stop(progress)
+        except SourceExhaustedError:
+            reason = "all frames are replayed"
+        self._note_session(reason)
+        return reason
+
+    def progress(self, trouble: str = "") -> Progress:
+        """The state of the recording."""
+        estimate = None if self._estimator is None else self._estimator.update(self._tracker.n_accepted)
+        now_s = self._equipment.clock.monotonic_s()
+        return self._tracker.snapshot(now_s, self._source.status, estimate, trouble)
+
+    def _line(
+        self, role: str, camera: Camera, model: CameraModel, region: NDArray[np.uint8] | None = None
+    ) -> CameraLine:
+        shortest_s, longest_s = camera.exposure_range_s
+        settings = self._settings
+        rule = exposure_rule(
+            model, max(settings.shortest_s, shortest_s), min(settings.longest_s, longest_s), settings.target_share
+        )
+        return CameraLine(role, camera, model, rule, settings.first_exposure_s, region)
+
+    def _facet_region(self) -> NDArray[np.uint8]:
+        camera = self._instrument.reflector_camera
+        region = np.zeros((camera.n_rows, camera.n_columns), dtype=np.uint8)
+        polygons = [self._instrument.facet_polygons_px[facet_id] for facet_id in self._store.facet_ids]
+        cv2.fillPoly(region, [np.rint(polygon).astype(np.int32) for polygon in polygons], 255)
+        return region
+
+    def _measured(self, pair: Pair) -> Record:
+        if self._replayed is not None:
+            index, label = next(self._replayed)
+        else:
+            index = self._next_index
+            label = f"{pair.done:%Y%m%dT%H%M%S}_{index:06d}"
+            self._watch_wall_clock(pair.done)
+        record = replace(
+            measure_record(
+                pair.star.image,
+                pair.reflector.image,
+                pair.star.exposure_s,
+                pair.reflector.exposure_s,
+                self._instrument,
+                self._photometer,
+                index,
+                label,
+            ),
+            star_mid_exposure_s=pair.star.mid_exposure_s + self._offset_s,
+            reflector_mid_exposure_s=pair.reflector.mid_exposure_s + self._offset_s,
+        )
+        if not np.isfinite(record.theta_rad).all():
+            return record
+        speed = speed_rad_per_s(self._before, record)
+        self._before = record
+        self._speeds.append(speed)
+        return judge_motion(record, speed, self._settings.max_motion_share * self._instrument.star_size_rad)
+
+    def _longest_exposure_s(self) -> float:
+        """What the telescope's motion allows: a longer exposure would only be rejected."""
+        known = [speed for speed in self._speeds if speed > 0.0]
+        if not known:
+            return math.inf
+        limit_rad = self._settings.max_motion_share * self._instrument.star_size_rad
+        return max(MOTION_MARGIN * limit_rad / float(np.median(known)), self._settings.first_exposure_s)
+
+    def _watch_wall_clock(self, now: datetime) -> None:
+        if self._last_wall is not None and now < self._last_wall - CLOCK_STEP:
+            back = self._last_wall - now
+            self.events.append(
+                f"the computer's clock was set back by {back}: labels go back with it, the records' order and times "
+                "do not"
+            )
+        self._last_wall = now
+
+    def _store_patiently(self, record: Record, pair: Pair, on_progress: Callable[[Progress], None]) -> bool:
+        """Put the record on the disk; wait for a full one. False when somebody asks to stop meanwhile."""
+        is_waiting = False
+        while True:
+            try:
+                self._put(record, pair)
+            except StoreError as error:
+                if not is_mended_by_waiting(error):
+                    raise
+                if not is_waiting:
+                    self.events.append(f"record {record.index} had to wait for the disk: {error}")
+                is_waiting = True
+                on_progress(self.progress(f"{error}; trying again every {self._settings.store_retry_s:g} s"))
+                if self._is_asked_to_stop.wait(self._settings.store_retry_s):
+                    return False
+            else:
+                self._next_index = record.index + 1
+                return True
+
+    def _put(self, record: Record, pair: Pair) -> None:
+        if self._settings.keep_frames:
+            for camera, exposure in (("star_camera", pair.star), ("reflector_camera", pair.reflector)):
+                if exposure.image.dtype != np.uint8:
+                    raise ConfigError(
+                        f"{camera}: frames of type {exposure.image.dtype} cannot be kept, only of 8 bit: "
+                        "record with --keep-frames none"
+                    )
+                self._store.add_frame(record.index, camera, exposure.image.astype(np.uint8, copy=False))
+        self._store.append([record])
+
+    def _note_session(self, reason: str) -> None:
+        """Leave what the records do not say with the run."""
+        status = self._source.status
+        sessions = json.loads(self._store.note(NOTE_SESSIONS) or "[]")
+        sessions.append(
+            {
+                "ended": reason,
+                "dropped_pairs": {cause.value: n for cause, n in status.dropped.items()},
+                "frames_missed": status.n_frames_missed,
+                "events": self.events,
+            }
+        )
+        try:
+            self._store.set_note(NOTE_SESSIONS, json.dumps(sessions))
+        except StoreError as error:
+            self.events.append(f"the session's counts could not be noted in the run: {error}")
+
+
+def speed_rad_per_s(before: Record | None, record: Record) -> float:
+    """Speed of the star over the camera between two records with a star; NaN when unknown.
+
+    From middle to middle of the star camera's exposures: what a telescope did that went on at its pace.
+    """
+    if before is None:
+        return math.nan
+    elapsed_s = record.star_mid_exposure_s - before.star_mid_exposure_s
+    if not 0.0 < elapsed_s <= MAX_SPEED_BASE_S:  # NaN as well
+        return math.nan
+    return float(np.hypot(*(record.theta_rad - before.theta_rad))) / elapsed_s
+
+
+def judge_motion(record: Record, speed_rad_per_s: float, limit_rad: float) -> Record:
+    """The record, rejected when the telescope moved by more than `limit_rad` during the longer exposure."""
+    longer_s = max(record.star_exposure_s, record.reflector_exposure_s)
+    moved_rad = speed_rad_per_s * longer_s
+    if record.reject_reason is not None or not moved_rad > limit_rad:
+        return record
+    detail = (
+        f"the star moved by {rad_to_deg(moved_rad):.4f} deg in the exposure of {longer_s:.3g} s "
+        f"(limit {rad_to_deg(limit_rad):.4f} deg): let the telescope wander more slowly"
+    )
+    return replace(record, reject_reason=RejectReason.TELESCOPE_MOVED, detail=detail)
+
+
+def is_mended_by_waiting(error: StoreError) -> bool:
+    """True for a disk that is full, gone or busy; False for a run that is damaged."""
+    cause = error.__cause__
+    if isinstance(cause, sqlite3.Error):
+        return getattr(cause, "sqlite_errorcode", -1) & 0xFF in _DISK_CODES
+    return isinstance(cause, OSError) and cause.errno in _DISK_ERRNOS

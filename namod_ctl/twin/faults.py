@@ -1,0 +1,162 @@
+"""The catalogue of faults: one name each, injected by one call, described by data."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from namod_ctl.core.errors import ConfigError
+from namod_ctl.core.units import deg_to_rad
+from namod_ctl.twin.settings import FaultSpec
+
+Value = float | str
+
+
+@dataclass(frozen=True, slots=True)
+class FaultKind:
+    """What a fault does, for people, and its parameters with their defaults."""
+
+    description: str
+    defaults: Mapping[str, Value]
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One injected fault.
+
+    Attributes
+    ----------
+    number
+        Which of all injected faults this is; seeds what is random in it.
+    end_s
+        Infinite for a fault that stays.
+    """
+
+    name: str
+    number: int
+    start_s: float
+    end_s: float
+    params: Mapping[str, Value]
+
+    def is_active(self, time_s: float) -> bool:
+        """Does the fault last at `time_s`?"""
+        return self.start_s <= time_s < self.end_s
+
+    def touches(self, start_s: float, end_s: float) -> bool:
+        """Does the fault last at any moment from `start_s` to `end_s`?"""
+        return self.start_s < end_s and start_s < self.end_s
+
+    def value(self, name: str) -> float:
+        """A parameter that is a number."""
+        return float(self.params[name])
+
+    def concerns(self, camera: str) -> bool:
+        """Is it a fault of this camera, "star" or "reflector"?"""
+        return self.params.get("camera", camera) in (camera, "both")
+
+
+CATALOGUE: Mapping[str, FaultKind] = {
+    "clouds": FaultKind(
+        "clouds drift by: the light falls by up to `factor`, smoothly, over and over within `period_s`",
+        {"factor": 30.0, "period_s": 60.0},
+    ),
+    "clouds_total": FaultKind("an opaque cloud: no light of any star", {}),
+    "second_star": FaultKind(
+        "another star in the field, at an offset from the reference star",
+        {"offset_x_rad": deg_to_rad(0.25), "offset_y_rad": deg_to_rad(0.1), "fainter_mag": 0.5},
+    ),
+    "satellite": FaultKind(
+        "a satellite draws a streak through the field, once, at the fault's start",
+        {"speed_rad_per_s": deg_to_rad(0.6), "angle_rad": 0.5, "miss_rad": deg_to_rad(0.1), "magnitude": -1.0},
+    ),
+    "aircraft": FaultKind(
+        "an aircraft crosses the field with a steady and a blinking light",
+        {
+            "speed_rad_per_s": deg_to_rad(1.5),
+            "angle_rad": 2.0,
+            "miss_rad": deg_to_rad(0.15),
+            "magnitude": -3.5,
+            "blink_s": 0.25,
+        },
+    ),
+    "moonlight": FaultKind(
+        "the moon lights sky and scene, stronger to one side; shares of a magnitude 0 star's brightest pixel",
+        {"level_share": 0.006, "gradient_share": 0.006, "angle_rad": 0.8},
+    ),
+    "twilight": FaultKind(
+        "the sky brightens: by e every `rise_s`, from `level_share` of a magnitude 0 star's brightest pixel",
+        {"level_share": 0.002, "rise_s": 120.0},
+    ),
+    "dew": FaultKind(
+        "dew on a lens (camera = star, reflector or both): its light decays with `decay_s` down to `floor`",
+        {"camera": "reflector", "decay_s": 600.0, "floor": 0.3},
+    ),
+    "dropped_frame": FaultKind("frames get lost on their way, a `share` of them", {"camera": "both", "share": 1.0}),
+    "torn_frame": FaultKind(
+        "frames arrive incomplete; is_reported = 0: the camera does not notice and delivers a torn image",
+        {"camera": "both", "share": 1.0, "is_reported": 1.0},
+    ),
+    "hot_pixels": FaultKind("more hot pixels", {"camera": "both", "count": 3000.0, "adu_per_s": 400.0}),
+    "telescope_jump": FaultKind(
+        "the telescope jumps by this much and stays there until the fault ends",
+        {"x_rad": deg_to_rad(0.15), "y_rad": deg_to_rad(-0.1)},
+    ),
+    "clock_set_back": FaultKind("somebody sets the computer's wall clock back", {"by_s": 3600.0}),
+    "camera_lost": FaultKind("a camera does not answer any more", {"camera": "reflector"}),
+}
+
+
+class FaultPlan:
+    """All injected faults of one twin."""
+
+    def __init__(self) -> None:
+        self._faults: tuple[Fault, ...] = ()
+
+    def inject(self, spec: FaultSpec) -> Fault:
+        """Add a fault.
+
+        Raises
+        ------
+        ConfigError
+            No such fault or parameter, or a value of the wrong kind; it names what there is.
+        """
+        kind = CATALOGUE.get(spec.name)
+        if kind is None:
+            raise ConfigError(f"there is no fault {spec.name!r}; there are: {', '.join(CATALOGUE)}")
+        for key, value in spec.params.items():
+            if key not in kind.defaults:
+                known = ", ".join(kind.defaults) or "none"
+                raise ConfigError(f"fault {spec.name!r} has no parameter {key!r}; its parameters: {known}")
+            _refuse_wrong_value(spec.name, key, value, kind.defaults[key])
+        duration_s = math.inf if spec.duration_s is None else spec.duration_s
+        if not (spec.start_s >= 0.0 and duration_s > 0.0):
+            raise ConfigError(
+                f"fault {spec.name!r}: start_s = {spec.start_s:g}, duration_s = {duration_s:g}; "
+                "the start must not be negative, the duration positive"
+            )
+        params = {**kind.defaults, **spec.params}
+        fault = Fault(spec.name, len(self._faults), spec.start_s, spec.start_s + duration_s, params)
+        self._faults = (*self._faults, fault)
+        return fault
+
+    def of(self, name: str) -> list[Fault]:
+        """All faults of that name, whenever they happen."""
+        return [fault for fault in self._faults if fault.name == name]
+
+    def active(self, name: str, time_s: float, camera: str = "both") -> list[Fault]:
+        """The faults of that name (and camera) that last at `time_s`."""
+        return [fault for fault in self.of(name) if fault.is_active(time_s) and fault.concerns(camera)]
+
+    def wall_clock_error_s(self, time_s: float) -> float:
+        """By how much the wall clock is wrong."""
+        return -sum(fault.value("by_s") for fault in self.active("clock_set_back", time_s))
+
+
+def _refuse_wrong_value(fault: str, key: str, value: Value, default: Value) -> None:
+    where = f"fault {fault!r}: {key} = {value!r}"
+    if isinstance(default, str):
+        if value not in ("star", "reflector", "both"):
+            raise ConfigError(f"{where}; it must be 'star', 'reflector' or 'both'")
+    elif isinstance(value, str) or not math.isfinite(value):
+        raise ConfigError(f"{where}; it must be a finite number")
