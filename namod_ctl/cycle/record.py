@@ -122,7 +122,7 @@ class StopRule:
         """Why the recording is complete, for a person; empty while it is not."""
         estimate = progress.estimate
         if self.n_records is not None and progress.n_accepted >= self.n_records:
-            return f"{progress.n_accepted} records count"
+            return "all records wanted are there"
         if self.duration_s is not None and progress.elapsed_s >= self.duration_s:
             return f"{progress.elapsed_s / 60.0:.1f} minutes are over"
         if (
