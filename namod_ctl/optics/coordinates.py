@@ -21,11 +21,6 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
-def theta_of_tilt(tilt_rad: Array) -> Array:
-    """Star direction at which a facet of that tilt is brightest; arrays of shape (..., 2), rad."""
-    return 2.0 * tilt_rad
-
-
 def correction_of_theta(theta_rad: Array) -> Array:
     """Phi, to be added to the facet's normal, for a facet that is brightest at `theta_rad`; (..., 2), rad."""
     return -theta_rad / 2.0
