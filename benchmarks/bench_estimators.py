@@ -69,7 +69,9 @@ def with_wrong_stars(table: ResponseTable, seed: int) -> ResponseTable:
     theta = table.theta_rad.copy()
     wrong = rng.random(len(theta)) < WRONG_STAR_SHARE
     theta[wrong] = disc(rng, int(wrong.sum()))
-    return ResponseTable(table.facet_ids, table.record_index, theta, table.theta_uncertainty_rad, table.response)
+    return ResponseTable(
+        table.facet_ids, table.record_index, theta, table.theta_uncertainty_rad, table.response, table.faintness
+    )
 
 
 def made_runs() -> None:
@@ -99,7 +101,12 @@ def fact_halves(folder: Path) -> None:
     print(f"{'':18s}{'median':>10s}{'rms':>10s}")
     n = len(maps.theta_rad)
     table = ResponseTable(
-        tuple(range(1, maps.response.shape[1] + 1)), np.arange(n), maps.theta_rad, np.full(n, np.nan), maps.response
+        tuple(range(1, maps.response.shape[1] + 1)),
+        np.arange(n),
+        maps.theta_rad,
+        np.full(n, np.nan),
+        maps.response,
+        np.ones(n),
     )
     for name, estimate in ESTIMATORS.items():
         even, odd = (estimate(table.select(np.arange(first, n, 2))) for first in (0, 1))

@@ -47,7 +47,9 @@ def make_table(n_records: int, n_facets: int, seed: int = 1) -> tuple[ResponseTa
         )
         response[:, j] = light * np.exp(0.05 * rng.standard_normal(n_records)) + 1e-3 * rng.random(n_records)
     n = np.arange(n_records)
-    return ResponseTable(tuple(range(n_facets)), n, theta, np.full(n_records, np.nan), response), centres
+    return ResponseTable(
+        tuple(range(n_facets)), n, theta, np.full(n_records, np.nan), response, np.ones(n_records)
+    ), centres
 
 
 def make_instrument(n_facets: int) -> Instrument:

@@ -45,7 +45,7 @@ class _Witnesses:
     columns: list[int]
     scale: Array
     background: Array  # [facet], level of the dark records
-    dark: Array  # [facet], scatter of the dark records about it, of whatever cause
+    dark: Array  # [facet], scatter of the dark records about it with a star of typical brightness, of whatever cause
     light_at_records: Array  # [record, facet]
     model_variance: Array  # [record, facet], of the light, from the uncertainty of the fits
 
@@ -62,7 +62,7 @@ def find_bad_records(
     facets = [fit for fit in fits if fit is not None]
     witnesses = _question(table, columns, facets)
     responses, light = table.response[:, columns], witnesses.light_at_records
-    loss_here = _loss(responses, witnesses, light, noise, witnesses.model_variance)
+    loss_here = _loss(responses, witnesses, light, noise, witnesses.model_variance, table.faintness[:, None])
     total = loss_here.sum(axis=1)
     # a story can win by no more than what the record has lost, so most records need no second look
     suspects = np.flatnonzero(total > _EVIDENCE)
@@ -82,10 +82,11 @@ def _question(table: ResponseTable, columns: list[int], facets: list[FacetFit]) 
         facet_light, jacobian = evaluate(fit.parameters, table.theta_rad)
         light.append(facet_light)
         variance.append(np.einsum("ij,jk,ik->i", jacobian, fit.covariance, jacobian))
-        unlit = table.response[facet_light < _DARK, j] / fit.scale
-        unlit = unlit[np.isfinite(unlit)]
-        background.append(float(np.median(unlit)) if len(unlit) else 0.0)
-        dark.append(float(np.quantile(np.abs(unlit - background[-1]), 0.8)) / _SIGMA_80 if len(unlit) else 0.0)
+        unlit = (facet_light < _DARK) & np.isfinite(table.response[:, j])
+        shown = table.response[unlit, j] / fit.scale
+        background.append(float(np.median(shown)) if len(shown) else 0.0)
+        off = np.abs(shown - background[-1]) / table.faintness[unlit]
+        dark.append(float(np.quantile(off, 0.8)) / _SIGMA_80 if len(shown) else 0.0)
     return _Witnesses(
         columns,
         np.array([fit.scale for fit in facets]),
@@ -97,12 +98,19 @@ def _question(table: ResponseTable, columns: list[int], facets: list[FacetFit]) 
 
 
 def _loss(
-    response: Array, witnesses: _Witnesses, light: Array, noise: NoiseModel, model_variance: Array | float
+    response: Array,
+    witnesses: _Witnesses,
+    light: Array,
+    noise: NoiseModel,
+    model_variance: Array | float,
+    faintness: Array | float,
 ) -> Array:
     """Loss of each response (last axis: facets) given the light of each facet; not measured ones lose nothing."""
     measured = response / witnesses.scale
     expected = light + witnesses.background
-    variance = y_slope(expected) ** 2 * (noise.variance(light) + witnesses.dark**2 + model_variance)
+    variance = y_slope(expected) ** 2 * (
+        noise.variance(light, faintness) + (witnesses.dark * faintness) ** 2 + model_variance
+    )
     loss = student_loss(to_y(np.nan_to_num(measured)) - to_y(expected), variance)
     shared: Array = np.where(np.isfinite(measured), loss, 0.0)
     return shared
@@ -126,18 +134,18 @@ def _judge(
     noise: NoiseModel,
     size_rad: float,
 ) -> BadRecord | None:
-    response = table.response[i, witnesses.columns]
+    response, faint = table.response[i, witnesses.columns], float(table.faintness[i])
     here = float(loss_here.sum())
     light = witnesses.light_at_records[i]
     factors = np.exp(_LOG_FACTORS)[:, None]
 
     variance = witnesses.model_variance[i]
-    scaled = _loss(response, witnesses, factors * light, noise, factors**2 * variance).sum(axis=1)
+    scaled = _loss(response, witnesses, factors * light, noise, factors**2 * variance, faint).sum(axis=1)
     glare = np.geomspace(0.05, 3.0, 10)[:, None] * np.median(witnesses.scale) / witnesses.scale
-    added = _loss(response, witnesses, light + glare, noise, 0.0).sum(axis=1)
+    added = _loss(response, witnesses, light + glare, noise, 0.0, faint).sum(axis=1)
     elsewhere = np.stack(
         [
-            _loss(response, witnesses, lit, noise, (_RELATIVE * lit) ** 2).sum(axis=1)
+            _loss(response, witnesses, lit, noise, (_RELATIVE * lit) ** 2, faint).sum(axis=1)
             for lit in factors[:, None] * light_on_grid
         ]
     )

@@ -14,7 +14,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from namod_ctl.reconstruction.facet_psf import CENTRE, ELONGATION_1, ELONGATION_2, background_of, evaluate
+from namod_ctl.reconstruction.facet_psf import (
+    BACKGROUND,
+    CENTRE,
+    ELONGATION_1,
+    ELONGATION_2,
+    GRADIENT_Y,
+    background_of,
+    evaluate,
+)
 
 Array = NDArray[np.float64]
 
@@ -28,16 +36,20 @@ _SCALE_RANGE = 1000.0
 
 @dataclass(frozen=True, slots=True)
 class NoiseModel:
-    """Variance of a facet's response in units of its scale: dark^2 + shot^2 * light + relative^2 * light^2."""
+    """Variance of a facet's response, in units of its scale.
+
+    It is (dark * faintness)^2 + shot^2 * light + relative^2 * light^2: what a dark facet shows does not come from the
+    star, so divided by a faint star its noise is larger by as much.
+    """
 
     dark: float
     shot: float
     relative: float
 
-    def variance(self, light: Array) -> Array:
-        """Variance of the response where the facet's light is `light` (units of the scale)."""
+    def variance(self, light: Array, faintness: Array | float) -> Array:
+        """Variance of the response where the facet's light is `light` (units of the scale), with a star that faint."""
         positive = np.maximum(light, 0.0)
-        variance: Array = self.dark**2 + self.shot**2 * positive + self.relative**2 * positive**2
+        variance: Array = (self.dark * faintness) ** 2 + self.shot**2 * positive + self.relative**2 * positive**2
         return variance
 
 
@@ -61,9 +73,9 @@ class FacetFit:
         Response of the facet that counts as 1.
     used
         Shape (n_used,). Indices of the records in the window.
-    residual, variance, slope, light, leverage
+    residual, variance, slope, light, leverage, faintness
         Shape (n_used,). Residual and its expected variance in y, dy/dR, light above background in units of
-        scale, and the share of each residual that the fit has absorbed.
+        scale, the share of each residual that the fit has absorbed, and how faint the star was.
     """
 
     parameters: Array
@@ -75,6 +87,7 @@ class FacetFit:
     slope: Array
     light: Array
     leverage: Array
+    faintness: Array
 
 
 def to_y(response: Array) -> Array:
@@ -104,6 +117,7 @@ def student_weight(residual: Array, variance: Array) -> Array:
 def fit_facet(
     theta_rad: Array,
     response: Array,
+    faintness: Array,
     scale: float,
     used: NDArray[np.int64],
     start: Array,
@@ -112,18 +126,19 @@ def fit_facet(
 ) -> FacetFit:
     """Posterior mode of one facet's parameters from the records `used`.
 
-    `theta_rad` (n, 2) and `response` (n,) hold all records, `start` and the prior have as many entries as there are
-    parameters (N_BASIC for a plain gaussian). Responses that are NaN must not be in `used`.
+    `theta_rad` (n, 2), `response` and `faintness` (n,) hold all records, `start` and the prior have as many entries as
+    there are parameters (N_BASIC for a plain gaussian). Responses that are NaN must not be in `used`.
     """
-    theta, measured = theta_rad[used], response[used] / scale
+    theta, measured, faint = theta_rad[used], response[used] / scale, faintness[used]
     y = to_y(measured)
     precision = 1.0 / prior.sigma**2
 
     def linearize(parameters: Array) -> tuple[Array, Array, Array, Array, Array]:
         light, jacobian = evaluate(parameters, theta)
-        expected = light + background_of(parameters, theta)
+        expected = light + background_of(parameters, theta) * faint
+        jacobian[:, BACKGROUND : GRADIENT_Y + 1] *= faint[:, None]
         slope = y_slope(expected)
-        return y - to_y(expected), slope[:, None] * jacobian, slope**2 * noise.variance(light), slope, light
+        return y - to_y(expected), slope[:, None] * jacobian, slope**2 * noise.variance(light, faint), slope, light
 
     def misfit(residual: Array, variance: Array, parameters: Array) -> float:
         return float(student_loss(residual, variance).sum() + 0.5 * (precision * (parameters - prior.mean) ** 2).sum())
@@ -158,7 +173,8 @@ def fit_facet(
     curvature[np.diag_indices_from(curvature)] += precision
     covariance: Array = np.linalg.inv(curvature).astype(np.float64)
     leverage = weight * np.einsum("ij,jk,ik->i", jacobian, covariance, jacobian)
-    return FacetFit(parameters, covariance, scale, used, residual, variance, slope, light, np.minimum(leverage, 0.97))
+    leverage = np.minimum(leverage, 0.97)
+    return FacetFit(parameters, covariance, scale, used, residual, variance, slope, light, leverage, faint)
 
 
 def response_scales(response: Array) -> Array:

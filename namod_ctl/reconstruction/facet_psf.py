@@ -2,7 +2,7 @@
 
 The normalized response of a facet over the star's direction Theta is modelled as
 
-    mu(Theta) = background + gradient . Theta
+    mu(Theta) = (background + gradient . Theta) * faintness of the star
                 + flux / (2 pi sqrt(det cov)) * exp(-|u|^2 / 2) * P(1 + sum_ab c_ab h_a(u_1) h_b(u_2)),
     u = W (Theta - centre),
 

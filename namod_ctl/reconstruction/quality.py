@@ -52,14 +52,15 @@ def n_lit_records(fit: FacetFit, response: Array) -> int:
     return int(np.count_nonzero(response[fit.used] - dark > _LIT_SHARE * fit.scale))
 
 
-def has_signal(fit: FacetFit, theta_rad: Array, response: Array) -> bool:
+def has_signal(fit: FacetFit, table: ResponseTable, facet: int) -> bool:
     """True when the facet's point spread function is brighter than its dark records ever are.
 
-    `theta_rad` (n, 2) and `response` (n,) are all records of the facet, NaN is ignored. Dark records are those far from
-    the centre; where the scan has too few of those, the dimmer half of all.
+    `facet` is a column of the table, NaN is ignored. Compared is the brightness itself: with a faint star, darkness
+    seems to respond. Dark records are those far from the centre; where the scan has too few of those, the dimmer half.
     """
+    response = table.response[:, facet] / table.faintness
     measured = np.isfinite(response)
-    offset = theta_rad - fit.parameters[CENTRE]
+    offset = table.theta_rad - fit.parameters[CENTRE]
     inverse = np.linalg.inv(covariance_of_light(fit.parameters))
     is_near = np.einsum("ia,ab,ib->i", offset, inverse, offset) < _FAR_SIGMA**2
     dark, near = response[measured & ~is_near], response[measured & is_near]
@@ -86,7 +87,7 @@ def judge_fit(
 ) -> Verdict:
     """Verdict on a facet's robust estimate; `size_rad` is the width against which its uncertainty is measured."""
     response = table.response[:, column]
-    if not has_signal(fit, table.theta_rad, response):
+    if not has_signal(fit, table, column):
         return Verdict(FacetFlag.NO_SIGNAL, ("no response rises above the facet's background",), centre_cov_rad2)
     flags, remarks = FacetFlag.NONE, []
     centre = fit.parameters[CENTRE]

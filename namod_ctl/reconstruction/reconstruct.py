@@ -25,6 +25,7 @@ from namod_ctl.reconstruction.psf import area_now, area_of_histograms, area_pred
 from namod_ctl.reconstruction.quality import ScanRegion, judge_fit, n_lit_records
 from namod_ctl.reconstruction.responses import ResponseTable
 from namod_ctl.reconstruction.robust import Family, fit_reflector
+from namod_ctl.reconstruction.scene import without_scene
 from namod_ctl.reconstruction.uncertainty import misfit_factors, repetition_factor
 
 Array = NDArray[np.float64]
@@ -32,6 +33,7 @@ Array = NDArray[np.float64]
 DEFAULT_BIN_SIZE_RAD = deg_to_rad(0.01)
 MIN_RECORDS = 10
 _N_SCREENINGS = 3  # without the worst records the fits may show further ones
+_N_SCENES = 2  # the first fits to a run under clouds are too wide, and hide some of the scene
 _RAYS_PER_FACET = 500
 
 
@@ -151,8 +153,14 @@ def _screen(
 ) -> tuple[list[BadRecord], ResponseTable, Family, list[FacetFit | None]]:
     """Bad records, the table without them, and the fits to it."""
     bad: list[BadRecord] = []
+    family, fits = fit_reflector(table, expected_rad)
+    for _ in range(_N_SCENES):
+        steady = without_scene(table, fits)
+        if steady is table:
+            break
+        table = steady
+        family, fits = fit_reflector(table, expected_rad)
     used = table
-    family, fits = fit_reflector(used, expected_rad)
     for _ in range(_N_SCREENINGS):
         found = find_bad_records(table, fits, family.noise, float(np.exp(family.log_size)))
         if {record.index for record in found} == {record.index for record in bad}:

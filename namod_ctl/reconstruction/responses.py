@@ -34,6 +34,9 @@ class ResponseTable:
         Shape (n_records,). One standard deviation per axis; NaN when unknown.
     response
         Shape (n_records, n_facets). R_ij = m_ij / s_i (arXiv:1605.06274, eq. of section 2); NaN where not measured.
+    faintness
+        Shape (n_records,). How many times fainter than in the run's typical record the star was; ones when unknown.
+        What does not come from the star is magnified by that much in `response`.
     """
 
     facet_ids: tuple[int, ...]
@@ -41,6 +44,7 @@ class ResponseTable:
     theta_rad: Array
     theta_uncertainty_rad: Array
     response: Array
+    faintness: Array
 
     @property
     def n_records(self) -> int:
@@ -55,6 +59,7 @@ class ResponseTable:
             self.theta_rad[keep],
             self.theta_uncertainty_rad[keep],
             self.response[keep],
+            self.faintness[keep],
         )
 
 
@@ -63,7 +68,8 @@ def tabulate_responses(records: Iterable[Record], facet_ids: Sequence[int]) -> R
 
     An unlit facet still shows the faint scene around the telescope, which does not fade with the star. Where the star's
     brightness varied over the run (clouds, zenith distance, another star), the scene of each facet, its dim
-    records' intensity, is therefore taken off before the intensity is divided by that of the star.
+    records' intensity, is therefore taken off before the intensity is divided by that of the star. What changes in the
+    scene meanwhile is taken off by `scene`, when the facets' light is known.
     """
     accepted = [record for record in records if record.reject_reason is None]
     n = len(accepted)
@@ -79,4 +85,5 @@ def tabulate_responses(records: Iterable[Record], facet_ids: Sequence[int]) -> R
         np.array([record.theta_rad for record in accepted], dtype=np.float64).reshape(n, 2),
         np.array([record.theta_uncertainty_rad for record in accepted], dtype=np.float64),
         np.where(np.isfinite(intensity), intensity, np.nan) / star[:, None],
+        np.median(star) / star if n else np.ones(0),
     )

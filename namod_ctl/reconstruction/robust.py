@@ -165,11 +165,7 @@ def _live(table: ResponseTable, scales: Array) -> NDArray[np.int64]:
 
 def _lit(fits: list[FacetFit], table: ResponseTable, columns: NDArray[np.int64]) -> list[FacetFit]:
     """The fits of facets that show light: the others have nothing to teach about point spread functions."""
-    return [
-        fit
-        for fit, j in zip(fits, columns.tolist(), strict=True)
-        if has_signal(fit, table.theta_rad, table.response[:, j])
-    ]
+    return [fit for fit, j in zip(fits, columns.tolist(), strict=True) if has_signal(fit, table, j)]
 
 
 def _first_family(log_size: float, expected_log_size: float) -> Family:
@@ -239,7 +235,7 @@ def _first_fit(table: ResponseTable, tree: cKDTree, facet: int, family: Family, 
         start = prior.mean.copy()
         start[CENTRE] = table.theta_rad[k]
         used = _window(tree, response, table.theta_rad[k], family.log_size)
-        fit = fit_facet(table.theta_rad, response, scale, used, start, prior, family.noise)
+        fit = fit_facet(table.theta_rad, response, table.faintness, scale, used, start, prior, family.noise)
         if best is None or _explained(fit, y) > _explained(best, y):
             best = fit
     assert best is not None  # a facet with a positive scale has at least one bright record
@@ -260,7 +256,7 @@ def _refit(table: ResponseTable, tree: cKDTree, facet: int, family: Family, last
     used = _window(tree, response, last.parameters[CENTRE], family.log_size)
     if len(used) < _MIN_RECORDS:
         used = _nearest(tree, response, last.parameters[CENTRE])
-    return fit_facet(table.theta_rad, response, last.scale, used, start, prior, family.noise)
+    return fit_facet(table.theta_rad, response, table.faintness, last.scale, used, start, prior, family.noise)
 
 
 def _learn(family: Family, facets: list[FacetFit]) -> Family:
@@ -304,11 +300,12 @@ def _learn_noise(noise: NoiseModel, facets: list[FacetFit]) -> NoiseModel:
     light = np.maximum(np.concatenate([fit.light for fit in facets]), 0.0)
     slope2 = np.concatenate([fit.slope for fit in facets]) ** 2
     freedom = 1.0 - np.concatenate([fit.leverage for fit in facets])
+    faintness = np.concatenate([fit.faintness for fit in facets])
     square = residual**2 / freedom
     first = np.log([0.01, 0.05, 0.1])
 
     def loss(log_terms: Array) -> float:
-        variance = slope2 * NoiseModel(*np.exp(log_terms)).variance(light)
+        variance = slope2 * NoiseModel(*np.exp(log_terms)).variance(light, faintness)
         student = 0.5 * np.log(variance) + 0.5 * (STUDENT_NU + 1.0) * np.log1p(square / (STUDENT_NU * variance))
         # a weak pull (a factor e^2) keeps a term finite that the data does not ask for
         return float((freedom * student).sum() + 0.125 * ((log_terms - first) ** 2).sum())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated
 
@@ -11,6 +12,7 @@ from rich.console import Console
 
 from namod_ctl.app.alignment_files import ALIGNMENT_FILE, alignment_files, alignment_to_json
 from namod_ctl.app.build import build_instrument
+from namod_ctl.app.combined_run import combined_run
 from namod_ctl.app.config import InstrumentConfig
 from namod_ctl.app.figure_style import figure_to_png
 from namod_ctl.app.figures import EXPOSURE_MAP_FILE, PSF_SUM_FILE, draw_exposure_map, draw_psf_sum
@@ -20,7 +22,7 @@ from namod_ctl.app.overlay import PNG_FILE
 from namod_ctl.app.psf_maps import PSF_MAPS_FILE, draw_psf_maps
 from namod_ctl.app.psf_panels import psf_panels
 from namod_ctl.app.reconstruction_report import REPORT_FILE, halves_text, report_text
-from namod_ctl.core.clock import SystemClock
+from namod_ctl.core.clock import Clock, SystemClock
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.units import deg_to_rad
 from namod_ctl.optics.instrument import Instrument
@@ -29,6 +31,7 @@ from namod_ctl.reconstruction.halves import compare_halves
 from namod_ctl.reconstruction.histograms import histogram_responses
 from namod_ctl.reconstruction.reconstruct import Reconstruction, reconstruct
 from namod_ctl.reconstruction.responses import tabulate_responses
+from namod_ctl.store.combine import NOTE_COMBINED
 from namod_ctl.store.results import write_results
 from namod_ctl.store.run import RunStore
 
@@ -36,7 +39,11 @@ _MIN_BIN_DEG, _MAX_BIN_DEG = 0.0005, 1.0
 
 
 def reconstruct_run(
-    run: Annotated[Path, typer.Argument(help="Folder of the run.")],
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folder of the run, or of several to combine.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="COMBINED", help="Several runs: folder of the run they become.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace an older combination of runs at --out.")] = False,
     estimator: Annotated[
         str, typer.Option(help=f"How a facet's centre is found: {', '.join(ESTIMATOR_NAMES)}.")
     ] = DEFAULT_ESTIMATOR,
@@ -53,7 +60,13 @@ def reconstruct_run(
     into the run's folder. Results of an earlier reconstruction there are replaced, and instructions made from it
     are removed; run.sqlite keeps every estimate.
 
+    Several runs of one telescope, on whatever stars and with whatever cameras, are first combined into the new run
+    COMBINED, which is then like any other; the runs themselves stay as they are. Where the cameras' scales differ
+    significantly between runs, the facets' light shows by which factor, and it is divided out.
+
     Example: namod-ctl reconstruct runs/2014-05
+
+    Example: namod-ctl reconstruct NIGHT1 NIGHT2 --out BOTH
     """
     if not _MIN_BIN_DEG <= bin_size_deg <= _MAX_BIN_DEG:
         raise ConfigError(
@@ -61,8 +74,30 @@ def reconstruct_run(
         )
     if estimator not in ESTIMATOR_NAMES:
         raise ConfigError(f"--estimator {estimator}: choose one of {', '.join(ESTIMATOR_NAMES)}")
-    bin_size_rad = deg_to_rad(bin_size_deg)
+    if len(runs) > 1 and out is None:
+        raise ConfigError(f"{len(runs)} runs are named: say with --out where the run goes that combines them")
+    if len(runs) == 1 and (out is not None or force):
+        raise ConfigError("--out and --force are for several runs: the results of one run go into its own folder")
     console = Console(highlight=False)
+    clock = SystemClock()
+    with ExitStack() as stack:
+        run = folder = runs[0]
+        if out is not None:
+            run = out
+            with console.status(f"combining {len(runs)} runs"):
+                folder = stack.enter_context(combined_run(runs, out, clock, force=force))
+        report = _reconstruct_in(folder, estimator, deg_to_rad(bin_size_deg), clock, console, halves=halves)
+    console.print(report, soft_wrap=True, markup=False)
+    console.print(
+        f"Written to {run}: {ALIGNMENT_FILE}, {REPORT_FILE}, tables and pictures. Next: namod-ctl instruct {run}",
+        soft_wrap=True,
+    )
+
+
+def _reconstruct_in(
+    run: Path, estimator: str, bin_size_rad: float, clock: Clock, console: Console, *, halves: bool
+) -> str:
+    """The report of the run's reconstruction; it and all other results are in the run's folder then."""
     with RunStore.open(run, read_only=False) as store:
         instrument = build_instrument(InstrumentConfig.from_json(store.config_json, f"{run}: config"))
         records = store.records()
@@ -72,16 +107,24 @@ def reconstruct_run(
             result = reconstruct(table, instrument, estimator, bin_size_rad)
             comparison = compare_halves(table, instrument, estimator, bin_size_rad) if halves else None
         report = report_text(result, n_rejected)
+        made_of = store.note(NOTE_COMBINED)
+        if made_of is not None:
+            bad = {record.index for record in result.alignment.bad_records}
+            report += _combination_text(made_of, [label for index, label in store.labels() if index in bad])
         if comparison is not None:
             report += halves_text(comparison)
         with console.status("drawing"):
             _write(run, result, instrument, bin_size_rad, report)
-        store.save_estimate(estimator, alignment_to_json(result.alignment), SystemClock())
-    console.print(report, soft_wrap=True, markup=False)
-    console.print(
-        f"Written to {run}: {ALIGNMENT_FILE}, {REPORT_FILE}, tables and pictures. Next: namod-ctl instruct {run}",
-        soft_wrap=True,
-    )
+        store.save_estimate(estimator, alignment_to_json(result.alignment), clock)
+    return report
+
+
+def _combination_text(made_of: str, bad_labels: list[str]) -> str:
+    """Which runs a combined run is made of and which of their records are bad, as plain text."""
+    lines = ["", "Combined from", *(f"  {line}" for line in made_of.splitlines())]
+    if bad_labels:
+        lines += ["", "Bad records, in the runs they come from", *(f"  {label}" for label in bad_labels)]
+    return "\n".join(lines) + "\n"
 
 
 def _write(run: Path, result: Reconstruction, instrument: Instrument, bin_size_rad: float, report: str) -> None:

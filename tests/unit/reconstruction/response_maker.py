@@ -148,7 +148,9 @@ def make_run(
         )  # a disc's variance per axis is a quarter of its radius^2
     response = light * np.exp(noise * rng.normal(size=light.shape)) + dark * np.abs(rng.normal(1, 0.3, light.shape))
     ids = tuple(range(1, len(centre) + 1))
-    table = ResponseTable(ids, np.arange(1, n_records + 1), theta, np.full(n_records, np.nan), response)
+    table = ResponseTable(
+        ids, np.arange(1, n_records + 1), theta, np.full(n_records, np.nan), response, np.ones(n_records)
+    )
     return MadeRun(table, centre, cov, flux, light)
 
 

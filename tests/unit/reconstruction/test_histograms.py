@@ -15,7 +15,7 @@ from namod_ctl.reconstruction.responses import ResponseTable
 def table_of(theta, response):
     theta, response = np.array(theta, dtype=float), np.array(response, dtype=float)
     n = len(theta)
-    return ResponseTable(tuple(range(response.shape[1])), np.arange(n), theta, np.full(n, np.nan), response)
+    return ResponseTable(tuple(range(response.shape[1])), np.arange(n), theta, np.full(n, np.nan), response, np.ones(n))
 
 
 @pytest.mark.parametrize("bin_size_rad", [0.01 * DEG, 0.037 * DEG, 2.0 * DEG])
