@@ -234,7 +234,7 @@ def _contradictions(config: InstrumentConfig, source: str) -> list[str]:
     for key in config.mount.facet_orientation_deg:
         if key not in set(map(str, ids)):
             problems.append(f"{source}: mount.facet_orientation_deg.{key}: there is no facet of this id")
-    return problems + _bad_polygons(config, set(ids), source)
+    return problems + _bad_polygons(config, set(ids), source) + _bad_target(config, source)
 
 
 def _misplaced_facets(config: InstrumentConfig, source: str) -> list[str]:
@@ -290,6 +290,19 @@ def _bad_polygons(config: InstrumentConfig, ids: set[int], source: str) -> list[
         if fault is not None:
             problems.append(f"{where}: {fault}")
     return problems
+
+
+def _bad_target(config: InstrumentConfig, source: str) -> list[str]:
+    if config.recording is None:
+        return []
+    share = config.recording.brightest_pixel_share
+    cameras = (("star_camera", config.star_camera), ("reflector_camera", config.reflector_camera))
+    return [
+        f"{source}: recording.brightest_pixel_share = {share:g} must be less than {name}.saturation_share = "
+        f"{camera.saturation_share:g}: every frame would be saturated"
+        for name, camera in cameras
+        if share >= camera.saturation_share
+    ]
 
 
 def _ranges(ids: set[int]) -> str:

@@ -223,6 +223,28 @@ class ReflectorMapSection(Section):
         return self
 
 
+class RecordingSection(Section):
+    """How `namod-ctl record` exposes, and what it lets pass; everything has a default.
+
+    `star_zero_point_mag` is the magnitude of a star whose intensity, as records have it, is 1.
+    """
+
+    brightest_pixel_share: Annotated[float, _within(0.3, 0.95)] = 0.8
+    shortest_exposure_s: Annotated[float, _within(1e-5, 60.0)] = 1e-3
+    longest_exposure_s: Annotated[float, _within(1e-3, 600.0)] = 3.0
+    max_motion_share: Annotated[float, _within(0.05, 5.0)] = 0.5
+    star_zero_point_mag: Annotated[float, _within(-50.0, 50.0)] | None = None
+
+    @model_validator(mode="after")
+    def _has_a_range(self) -> RecordingSection:
+        if self.shortest_exposure_s > self.longest_exposure_s:
+            raise ValueError(
+                f"shortest_exposure_s = {self.shortest_exposure_s:g} is more than longest_exposure_s = "
+                f"{self.longest_exposure_s:g}; exchange them"
+            )
+        return self
+
+
 class InstrumentSections(Section):
     """The whole file."""
 
@@ -232,3 +254,4 @@ class InstrumentSections(Section):
     star_camera: StarCameraSection
     reflector_camera: ReflectorCameraSection
     reflector_map: ReflectorMapSection | None = None
+    recording: RecordingSection | None = None

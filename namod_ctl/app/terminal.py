@@ -67,6 +67,7 @@ def plain_line(progress: Progress) -> str:
         f"{sum(progress.rejected.values())} rejected",
         f"{sum(progress.source.dropped.values())} frames retaken",
         f"{progress.rate_per_min:.0f} per minute",
+        f"star {star_brightness(progress)}",
         f"coverage {progress.coverage.share:.0%}",
         _uncertainty(progress),
     ]
@@ -105,6 +106,15 @@ def steering(progress: Progress) -> str:
     return f"bring the star {abs(x_deg):.2f} deg {right}, {abs(y_deg):.2f} deg {up}"
 
 
+def star_brightness(progress: Progress) -> str:
+    """The star's magnitude; without a zero point in the config, how much fainter it is than at best."""
+    if not math.isfinite(progress.star_magnitude):
+        return "not seen"
+    if not progress.is_magnitude_relative:
+        return f"{progress.star_magnitude:.2f} mag"
+    return f"{progress.star_magnitude:+.2f} mag relative to the brightest of this run"
+
+
 def _panel(progress: Progress, title: str) -> RenderableType:
     numbers = Table.grid(padding=(0, 2))
     wanted = "" if progress.n_wanted is None else f" of {progress.n_wanted}"
@@ -114,8 +124,7 @@ def _panel(progress: Progress, title: str) -> RenderableType:
     numbers.add_row(
         "exposures", f"star {_exposure(progress.star_exposure_s)}, reflector {_exposure(progress.reflector_exposure_s)}"
     )
-    seen = f"{progress.star_magnitude:.2f} mag" if math.isfinite(progress.star_magnitude) else "not seen"
-    numbers.add_row("star", f"{seen} (camera's own scale)")
+    numbers.add_row("star", star_brightness(progress))
     rejected = ", ".join(f"{n} {reason.value}" for reason, n in progress.rejected.items())
     numbers.add_row("rejected", rejected or "none")
     dropped = ", ".join(f"{n} {cause.value}" for cause, n in progress.source.dropped.items())
@@ -142,9 +151,12 @@ def _uncertainty(progress: Progress) -> str:
     estimate = progress.estimate
     if estimate is None:
         return "no estimate yet"
+    unseen = estimate.unseen_facet_ids
+    without = f"{len(unseen)} facets not seen; " if unseen else ""
+    if not math.isfinite(estimate.worst_uncertainty_rad):
+        return f"not known yet ({without}{estimate.n_records} records)"
     worst_arcmin = rad_to_arcmin(estimate.worst_uncertainty_rad)
-    without = f", {estimate.n_without} facets without" if estimate.n_without else ""
-    return f"+-{worst_arcmin:.2f} arcmin (facet {estimate.worst_facet_id}{without}; {estimate.n_records} records)"
+    return f"+-{worst_arcmin:.2f} arcmin (facet {estimate.worst_facet_id}; {without}{estimate.n_records} records)"
 
 
 def _exposure(exposure_s: float) -> str:

@@ -105,3 +105,13 @@ def um_to_m(length_um: T) -> T:
 def ms_to_s(time_ms: T) -> T:
     """Milliseconds as seconds."""
     return time_ms / 1000.0
+
+
+def celsius_to_k(temperature_celsius: T) -> T:
+    """Degrees Celsius (drives' thermometers) as kelvins."""
+    return temperature_celsius + 273.15
+
+
+def k_to_celsius(temperature_k: T) -> T:
+    """Kelvin as degrees Celsius (drives' own thermometers)."""
+    return temperature_k - 273.15

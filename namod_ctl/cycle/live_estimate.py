@@ -1,30 +1,49 @@
-"""The live estimate: what a run would reconstruct to at this moment, worked out beside the recording.
+"""The live estimate: how well a run knows its facets at this moment, worked out beside the recording.
 
 In a process of its own at low priority, so that neither the cameras nor the reduction wait for it. It reads the
-run from the disk; it is asked again when the run has grown by a fifth, so all estimates of a run together cost a few
-times the last one.
+run from the disk; it is asked again when the run has grown by a fifth.
+
+It is what `reconstruct` would say, without what the crew does not look at (corrections, areas, ray tracing). And it
+remembers what changes slowly from one estimate to the next: which records are bad, and how much worse random
+halves of the run agree than they should (`uncertainty.repetition_factor`). That needs the fits of several pairs of
+halves; here every estimate makes one pair, of half of the facets, and pools it with those of the estimates before.
 """
 
 from __future__ import annotations
 
 import os
 import signal
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from namod_ctl.core.errors import NamodError
+from namod_ctl.core.errors import DataQualityError, NamodError
+from namod_ctl.core.flags import FacetFlag
 from namod_ctl.optics.instrument import Instrument
-from namod_ctl.reconstruction.reconstruct import reconstruct
-from namod_ctl.reconstruction.responses import tabulate_responses
+from namod_ctl.reconstruction.bad_records import find_bad_records
+from namod_ctl.reconstruction.facet_fit import centre_covariance
+from namod_ctl.reconstruction.quality import ScanRegion, judge_fit
+from namod_ctl.reconstruction.reconstruct import MIN_RECORDS, expected_size_rad
+from namod_ctl.reconstruction.responses import ResponseTable, tabulate_responses
+from namod_ctl.reconstruction.robust import Family, fit_facets, fit_reflector
+from namod_ctl.reconstruction.scene import without_scene
+from namod_ctl.reconstruction.uncertainty import misfit_factors, pulls, repetition_factor, width_of_pulls
 from namod_ctl.store.run import RunStore
 
 FIRST_AT_RECORDS = 50
 GROWTH = 1.2
 _NICENESS = 10
+_N_SPLITS_KEPT = 4  # with FACT's 30 facets 120 pulls: the factor on the uncertainty is good to 6 %
+_LEAST_FACETS_PER_SPLIT, _MAX_FACETS_PER_SPLIT = 15, 50
+_FEWEST_FOR_SPLITS = 300  # records; below, the factor depends on how the halves happen to fall, and all are made
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,17 +55,18 @@ class LiveEstimate:
     n_records
         Accepted records it rests on.
     worst_uncertainty_rad
-        Larger half axis of the error ellipse (one standard deviation) of the facet that is known worst.
+        Larger half axis of the error ellipse (one standard deviation) of the facet that is known worst among those
+        that shine; infinite when none does.
     worst_facet_id
         That facet.
-    n_without
-        Facets without any estimate yet.
+    unseen_facet_ids
+        Facets that showed no light in any record (NO_SIGNAL): nothing is known about them.
     """
 
     n_records: int
     worst_uncertainty_rad: float
     worst_facet_id: int
-    n_without: int
+    unseen_facet_ids: tuple[int, ...]
 
 
 class LiveEstimator:
@@ -59,7 +79,8 @@ class LiveEstimator:
         # Ctrl-C reaches all processes of a terminal; the new one inherits that it is ignored, only we are interrupted
         before = signal.signal(signal.SIGINT, signal.SIG_IGN)
         try:
-            self._process.start()
+            with _one_thread():
+                self._process.start()
         finally:
             signal.signal(signal.SIGINT, before)
         theirs.close()
@@ -87,29 +108,111 @@ class LiveEstimator:
         self._connection.close()
 
 
-def estimate_run(path: Path, instrument: Instrument) -> LiveEstimate | None:
-    """What the run at `path` reconstructs to; None while its records are too few or too bad."""
+class RunningEstimate:
+    """Estimates of one run as it grows; what it remembers from one to the next makes them cheap."""
+
+    def __init__(self, instrument: Instrument) -> None:
+        self._expected_rad = expected_size_rad(instrument)
+        self._bad_records: set[int] = set()
+        self._pulls: deque[NDArray[np.float64]] = deque(maxlen=_N_SPLITS_KEPT)
+        self._rng = np.random.default_rng(0)
+
+    def of(self, table: ResponseTable) -> LiveEstimate:
+        """The estimate of all records so far.
+
+        Raises
+        ------
+        DataQualityError
+            They are too few or too bad.
+        """
+        if table.n_records < MIN_RECORDS:
+            raise DataQualityError(f"{table.n_records} records count, at least {MIN_RECORDS} are needed: record longer")
+        family, fits = fit_reflector(self._without_bad(table), self._expected_rad)
+        steady = without_scene(table, fits)
+        if steady is not table:
+            table = steady
+            family, fits = fit_reflector(self._without_bad(table), self._expected_rad)
+        used = self._without_bad(table)
+        found = find_bad_records(table, fits, family.noise, float(np.exp(family.log_size)))
+        self._bad_records = {record.index for record in found}  # left out the next time
+        factors = self._repetition(used, family) * misfit_factors(fits)
+        region = ScanRegion(used.theta_rad)
+        size_rad = min(float(np.exp(family.log_size)), self._expected_rad)
+        worst_rad2, worst_id, unseen = -np.inf, table.facet_ids[0], []
+        for j, (facet_id, fit) in enumerate(zip(table.facet_ids, fits, strict=True)):
+            verdict = None
+            if fit is not None:
+                verdict = judge_fit(fit, used, j, factors[j] * centre_covariance(fit), region, size_rad)
+            if verdict is None or verdict.flags & FacetFlag.NO_SIGNAL:
+                unseen.append(facet_id)
+                continue
+            variance_rad2 = _larger_variance(verdict.centre_cov_rad2)
+            if variance_rad2 > worst_rad2:
+                worst_rad2, worst_id = variance_rad2, facet_id
+        worst_rad = float(np.sqrt(worst_rad2)) if worst_rad2 >= 0.0 else np.inf
+        return LiveEstimate(table.n_records, worst_rad, worst_id, tuple(unseen))
+
+    def _without_bad(self, table: ResponseTable) -> ResponseTable:
+        used = table.select(~np.isin(table.record_index, list(self._bad_records)))
+        if used.n_records < MIN_RECORDS:
+            raise DataQualityError(f"{len(self._bad_records)} of {table.n_records} records disagree with the others")
+        return used
+
+    def _repetition(self, used: ResponseTable, family: Family) -> float:
+        if used.n_records < _FEWEST_FOR_SPLITS:
+            return repetition_factor(used, family)
+        while True:  # the first time until enough are there
+            self._pulls.append(self._pulls_of_a_split(used, family))
+            if len(self._pulls) == _N_SPLITS_KEPT:
+                break
+        values = np.concatenate(self._pulls)
+        return max(1.0, width_of_pulls(values) ** 2) if len(values) else 1.0
+
+    def _pulls_of_a_split(self, used: ResponseTable, family: Family) -> NDArray[np.float64]:
+        n_facets = len(used.facet_ids)
+        n_fitted = min(max((n_facets + 1) // 2, _LEAST_FACETS_PER_SPLIT), n_facets, _MAX_FACETS_PER_SPLIT)
+        facets = np.sort(self._rng.choice(n_facets, n_fitted, replace=False))
+        order = self._rng.permutation(used.n_records)
+        halves = (np.sort(order[: len(order) // 2]), np.sort(order[len(order) // 2 :]))
+        first, second = (fit_facets(used.select(half), family, facets) for half in halves)
+        return pulls(first, second)
+
+
+def _larger_variance(cov_rad2: NDArray[np.float64]) -> float:
+    """Variance along the larger half axis of an error ellipse; infinite for one that is not known."""
+    return float(np.linalg.eigvalsh(cov_rad2)[-1]) if np.isfinite(cov_rad2).all() else np.inf
+
+
+def _estimate(path: Path, running: RunningEstimate) -> LiveEstimate | None:
     try:
         with RunStore.open(path) as run:
             table = tabulate_responses(run.records(), run.facet_ids)
-        facets = reconstruct(table, instrument).alignment.facets
-    except NamodError:
+        return running.of(table)
+    except NamodError:  # of a run that is young or bad: there is nothing to say yet
         return None
-    variances = np.array([np.linalg.eigvalsh(np.nan_to_num(facet.theta_cov_rad2))[-1] for facet in facets])
-    worst = int(variances.argmax())
-    return LiveEstimate(
-        n_records=table.n_records,
-        worst_uncertainty_rad=float(np.sqrt(variances[worst])),
-        worst_facet_id=facets[worst].facet_id,
-        n_without=int(sum(not np.isfinite(facet.theta_rad).all() for facet in facets)),
-    )
 
 
 def _serve(connection: Connection, path: Path, instrument: Instrument) -> None:
     os.nice(_NICENESS)
+    running = RunningEstimate(instrument)
     try:
         while True:
             connection.recv()
-            connection.send(estimate_run(path, instrument))
+            connection.send(_estimate(path, running))
     except (EOFError, OSError):  # the recorder is gone
         return
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Processes started meanwhile do their linear algebra in one thread: more of them only take the cameras' time."""
+    before = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
+    os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

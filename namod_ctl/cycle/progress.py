@@ -58,7 +58,10 @@ class Progress:
     rate_per_min
         Accepted records during the last minute, per minute.
     star_magnitude
-        -2.5 log10 of the star's intensity: on the camera's own scale, without a zero point. NaN without a star.
+        Of the star as it is seen, behind air and clouds; NaN without a star.
+    is_magnitude_relative
+        True where the camera's zero point is not known: `star_magnitude` then counts from the brightest star that the
+        run has seen, and is how much fainter it is at the moment.
     theta_rad, next_theta_rad
         Shape (2,). Where the star stands (NaN when it is not seen), and where it should stand next.
     estimate
@@ -78,6 +81,7 @@ class Progress:
     star_exposure_s: float
     reflector_exposure_s: float
     star_magnitude: float
+    is_magnitude_relative: bool
     theta_rad: NDArray[np.float64]
     next_theta_rad: NDArray[np.float64]
     coverage: Coverage
@@ -92,11 +96,13 @@ class Tracker:
 
     region_radius_rad: float
     start_s: float
+    star_zero_point_mag: float | None = None
     n_wanted: int | None = None
     n_accepted: int = 0
     rejected: Counter[RejectReason] = field(default_factory=Counter)
     last: Record | None = None
     last_accepted_s: float = math.nan
+    brightest_star: float = 0.0
     recent: deque[tuple[float, RejectReason | None]] = field(default_factory=lambda: deque(maxlen=MAX_RECENT))
     dropped_before: dict[DropCause, int] = field(default_factory=dict)
     coverage: Coverage = field(init=False)
@@ -108,16 +114,14 @@ class Tracker:
     def add_earlier(self, record: Record) -> None:
         """Count a record of an earlier session of the run."""
         if record.reject_reason is None:
-            self.n_accepted += 1
-            self.coverage = with_record(self.coverage, record.theta_rad)
+            self._count(record)
 
     def add(self, record: Record, now_s: float, source: SourceStatus) -> None:
         """Count a record that has just been stored."""
         self.last = record
         self.recent.append((now_s, record.reject_reason))
         if record.reject_reason is None:
-            self.n_accepted += 1
-            self.coverage = with_record(self.coverage, record.theta_rad)
+            self._count(record)
             self.last_accepted_s = now_s
             self.dropped_before = source.dropped
         else:
@@ -129,6 +133,9 @@ class Tracker:
         """The state at this moment; `trouble` of the computer takes precedence over that of the cameras."""
         last = self.last
         theta_rad = np.full(2, np.nan) if last is None else last.theta_rad
+        zero_point_mag = self.star_zero_point_mag
+        if zero_point_mag is None:
+            zero_point_mag = -magnitude(self.brightest_star)
         return Progress(
             n_accepted=self.n_accepted,
             n_wanted=self.n_wanted,
@@ -138,7 +145,8 @@ class Tracker:
             rate_per_min=rate_per_min(self.recent, self.start_s, now_s),
             star_exposure_s=math.nan if last is None else last.star_exposure_s,
             reflector_exposure_s=math.nan if last is None else last.reflector_exposure_s,
-            star_magnitude=math.nan if last is None else magnitude(last.star_intensity),
+            star_magnitude=math.nan if last is None else zero_point_mag + magnitude(last.star_intensity),
+            is_magnitude_relative=self.star_zero_point_mag is None,
             theta_rad=theta_rad,
             next_theta_rad=where_next(self.coverage, theta_rad),
             coverage=self.coverage,
@@ -146,6 +154,11 @@ class Tracker:
             trouble=trouble or source.trouble,
             warning=self._warning(now_s, source),
         )
+
+    def _count(self, record: Record) -> None:
+        self.n_accepted += 1
+        self.coverage = with_record(self.coverage, record.theta_rad)
+        self.brightest_star = max(self.brightest_star, record.star_intensity)
 
     def _warning(self, now_s: float, source: SourceStatus) -> str:
         if now_s - self.last_accepted_s < WARN_AFTER_S:

@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 
 from namod_ctl.core.clock import Clock
 from namod_ctl.core.errors import ConfigError, StoreError
-from namod_ctl.core.flags import RejectReason
 from namod_ctl.core.interfaces import Camera, MonotonicClock
 from namod_ctl.core.records import Record
-from namod_ctl.core.units import deg_to_rad, rad_to_deg
+from namod_ctl.core.units import deg_to_rad
 from namod_ctl.cycle.live_estimate import LiveEstimator
+from namod_ctl.cycle.motion import judge_motion, speed_rad_per_s
 from namod_ctl.cycle.pairs import CameraLine, Pair, PairSource, SourceExhaustedError
 from namod_ctl.cycle.progress import Progress, Tracker
 from namod_ctl.imaging.exposure import exposure_rule
@@ -45,11 +45,12 @@ MIN_RECORDS_FOR_UNCERTAINTY = 100
 MIN_COVERAGE_FOR_UNCERTAINTY = 0.8
 """With fewer records, or emptier regions, the facets that are known worst are those not seen at all."""
 
+MIN_COVERAGE_FOR_UNSEEN = 0.95
+"""A facet that was not seen holds the rule of uncertainty up until the star has been nearly everywhere: then it does
+not throw its light into the region, and going on will not show it."""
+
 N_SPEEDS = 5
 """The telescope's speed is the median of so many: one jump, or one wrong star, does not count."""
-
-MAX_SPEED_BASE_S = 10.0
-"""Between records further apart than this the telescope may have gone anywhere: its speed is not known."""
 
 MOTION_MARGIN = 0.8
 """Of the longest exposure that the telescope's motion allows: it may quicken a little."""
@@ -85,6 +86,8 @@ class RecordSettings:
         Of the directions that are to be covered.
     store_retry_s
         A full disk is tried again after this time.
+    star_zero_point_mag
+        Magnitude of a star whose intensity, as records have it, is 1; None when nobody has found it out yet.
     """
 
     target_share: float = 0.8
@@ -98,6 +101,7 @@ class RecordSettings:
     keep_frames: bool = False
     region_radius_rad: float = deg_to_rad(0.35)
     store_retry_s: float = 5.0
+    star_zero_point_mag: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +115,7 @@ class StopRule:
     duration_s
         Of this session, on the cameras' clock.
     uncertainty_rad
-        Of the facet that is known worst.
+        Of the facet that is known worst. Facets that were not seen hold it up until the region is covered.
     """
 
     n_records: int | None = None
@@ -125,14 +129,15 @@ class StopRule:
             return "all records wanted are there"
         if self.duration_s is not None and progress.elapsed_s >= self.duration_s:
             return f"{progress.elapsed_s / 60.0:.1f} minutes are over"
-        if (
-            self.uncertainty_rad is not None
-            and estimate is not None
-            and estimate.n_records >= MIN_RECORDS_FOR_UNCERTAINTY
-            and progress.coverage.share >= MIN_COVERAGE_FOR_UNCERTAINTY
-            and estimate.worst_uncertainty_rad <= self.uncertainty_rad
-        ):
-            return "every facet is known well enough"
+        if self.uncertainty_rad is None or estimate is None or estimate.n_records < MIN_RECORDS_FOR_UNCERTAINTY:
+            return ""
+        unseen = estimate.unseen_facet_ids
+        least_coverage = MIN_COVERAGE_FOR_UNSEEN if unseen else MIN_COVERAGE_FOR_UNCERTAINTY
+        if progress.coverage.share >= least_coverage and estimate.worst_uncertainty_rad <= self.uncertainty_rad:
+            if not unseen:
+                return "every facet is known well enough"
+            ids = ", ".join(map(str, unseen))
+            return f"every facet that was seen is known well enough, but these were never seen: {ids}"
         return ""
 
 
@@ -192,7 +197,7 @@ class Recorder:
         times_s = [record.star_mid_exposure_s for record in earlier if np.isfinite(record.star_mid_exposure_s)]
         # A run's time begins with its first session and only ever grows; a replay has it already.
         self._offset_s = (max(times_s) + SESSION_GAP_S if times_s else 0.0) - now_s if replayed is None else 0.0
-        self._tracker = Tracker(settings.region_radius_rad, now_s)
+        self._tracker = Tracker(settings.region_radius_rad, now_s, settings.star_zero_point_mag)
         for record in earlier:
             self._tracker.add_earlier(record)
         self._source = PairSource(
@@ -362,32 +367,6 @@ class Recorder:
             self._store.set_note(NOTE_SESSIONS, json.dumps(sessions))
         except StoreError as error:
             self.events.append(f"the session's counts could not be noted in the run: {error}")
-
-
-def speed_rad_per_s(before: Record | None, record: Record) -> float:
-    """Speed of the star over the camera between two records with a star; NaN when unknown.
-
-    From middle to middle of the star camera's exposures: what a telescope did that went on at its pace.
-    """
-    if before is None:
-        return math.nan
-    elapsed_s = record.star_mid_exposure_s - before.star_mid_exposure_s
-    if not 0.0 < elapsed_s <= MAX_SPEED_BASE_S:  # NaN as well
-        return math.nan
-    return float(np.hypot(*(record.theta_rad - before.theta_rad))) / elapsed_s
-
-
-def judge_motion(record: Record, speed_rad_per_s: float, limit_rad: float) -> Record:
-    """The record, rejected when the telescope moved by more than `limit_rad` during the longer exposure."""
-    longer_s = max(record.star_exposure_s, record.reflector_exposure_s)
-    moved_rad = speed_rad_per_s * longer_s
-    if record.reject_reason is not None or not moved_rad > limit_rad:
-        return record
-    detail = (
-        f"the star moved by {rad_to_deg(moved_rad):.4f} deg in the exposure of {longer_s:.3g} s "
-        f"(limit {rad_to_deg(limit_rad):.4f} deg): let the telescope wander more slowly"
-    )
-    return replace(record, reject_reason=RejectReason.TELESCOPE_MOVED, detail=detail)
 
 
 def is_mended_by_waiting(error: StoreError) -> bool:

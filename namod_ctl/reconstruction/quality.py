@@ -68,6 +68,8 @@ def has_signal(fit: FacetFit, table: ResponseTable, facet: int) -> bool:
         dark = np.sort(response[measured])[: max(1, int(measured.sum()) // 2)]
     if len(near) < _MIN_LIT:
         near = response[fit.used]
+    if len(near) < _MIN_LIT:
+        return False
     level = float(np.median(dark))
     scatter = float(np.quantile(np.abs(dark - level), 0.95))
     return bool(np.sort(near)[-_MIN_LIT] - level > _MIN_CONTRAST * scatter)

@@ -8,7 +8,7 @@ import re
 import signal
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
 from typing import Annotated
@@ -17,16 +17,18 @@ import typer
 from rich.console import Console
 
 from namod_ctl.app.build import build_instrument
-from namod_ctl.app.build_twin import build_twin, with_facet_map
+from namod_ctl.app.build_recording import build_record_settings
+from namod_ctl.app.build_twin import build_twin, load_twin_settings, with_facet_map
 from namod_ctl.app.config import InstrumentConfig, load_config
 from namod_ctl.app.terminal import TerminalView
+from namod_ctl.app.twin_note import different_sections, note_twin, noted_twin
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.flags import REJECT_REASON_MEANING
 from namod_ctl.core.units import arcmin_to_rad, deg_to_rad
 from namod_ctl.cycle.live_estimate import LiveEstimator
 from namod_ctl.cycle.progress import Progress
-from namod_ctl.cycle.record import SESSION_GAP_S, Equipment, Recorder, RecordSettings, StopRule
+from namod_ctl.cycle.record import SESSION_GAP_S, Equipment, Recorder, StopRule
 from namod_ctl.cycle.replay import CAMERAS, ReplayCamera, ReplayClock, replayable_records
 from namod_ctl.optics.instrument import Instrument
 from namod_ctl.store.import_namod import KeepFrames
@@ -35,7 +37,6 @@ from namod_ctl.twin.settings import TwinSettings
 
 DEFAULT_N_RECORDS = 1300  # of FACT's night (arXiv:1605.06274, section 4)
 EXIT_INTERRUPTED = 130  # what shells report for a program that was ended by Ctrl-C
-NOTE_TWIN_SEED = "record.twin_seed"
 DEFAULT_SEED = 1
 
 _ANGLE = re.compile(r"([0-9]*\.?[0-9]+)\s*(arcmin|deg)")
@@ -47,6 +48,7 @@ class _Session:
 
     equipment: Equipment
     instrument: Instrument
+    config: InstrumentConfig
     store: RunStore
     pass_s: float
     replayed: Iterator[tuple[int, str]] | None = None
@@ -86,24 +88,32 @@ def record(
         bool, typer.Option("--twin", help="Record the digital twin, in its own time, as fast as the computer can.")
     ] = False,
     seed: Annotated[int | None, typer.Option(min=0, help="Of the twin: another seed is another telescope.")] = None,
+    twin_settings: Annotated[
+        Path | None,
+        typer.Option(
+            "--twin-settings",
+            metavar="FILE",
+            help="Sky, telescope, cameras and faults of the twin: a TOML file such as config/twin/rough_night.toml.",
+        ),
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace an older run at --out, at once.")] = False,
 ) -> None:
     """Record image pairs of a star and of the reflector into a run.
 
     Ctrl-C stops after the record in work; a second one stops at once, and the run keeps all records before it.
 
-    Example: namod-ctl record --twin --out RUN --records 300
+    Example: namod-ctl record --twin --twin-settings config/twin/rough_night.toml --out RUN --records 300
     """
     stop = _stop_rule(records, minutes, until_uncertainty, is_replay=replay is not None)
     console = Console(stderr=True, highlight=False)
     with ExitStack() as stack:
         if replay is not None:
-            if append is not None or config is not None or seed is not None or twin or every is not None:
+            if twin or any(option is not None for option in (append, config, seed, every, twin_settings)):
                 raise ConfigError("--replay takes everything from its run: give it --out and nothing else of the night")
             session = _replay(stack, replay, out, force=force)
             title = f"replay of {replay}"
         else:
-            session = _record_twin(stack, out, append, config, seed, force=force)
+            session = _record_twin(stack, out, append, config, seed, twin_settings, force=force)
             title = f"twin of {session.instrument.name}"
             if not twin:
                 console.print(
@@ -112,8 +122,11 @@ def record(
         pace_s = every or 0.0
         if every is None and stop.n_records is not None:
             pace_s = session.pass_s / stop.n_records
-        settings = RecordSettings(
-            keep_frames=keep_frames is KeepFrames.ALL, region_radius_rad=deg_to_rad(region_radius_deg), pace_s=pace_s
+        settings = replace(
+            build_record_settings(session.config),
+            keep_frames=keep_frames is KeepFrames.ALL,
+            region_radius_rad=deg_to_rad(region_radius_deg),
+            pace_s=pace_s,
         )
         estimator = None
         if replay is None:
@@ -145,34 +158,54 @@ def _angle_rad(text: str) -> float:
 
 
 def _record_twin(
-    stack: ExitStack, out: Path | None, append: Path | None, config: str | None, seed: int | None, *, force: bool
+    stack: ExitStack,
+    out: Path | None,
+    append: Path | None,
+    config: str | None,
+    seed: int | None,
+    settings_file: Path | None,
+    *,
+    force: bool,
 ) -> _Session:
     if (out is None) == (append is None):
         raise ConfigError("say where the records go: --out for a new run, or --append RUN to go on with one")
+    asked = None if settings_file is None else load_twin_settings(settings_file)
     if append is not None:
         store = stack.enter_context(RunStore.open(append, read_only=False))
-        noted = store.note(NOTE_TWIN_SEED)
+        noted = noted_twin(store)
         if noted is None:
             raise ConfigError(f"{append}: was not recorded with the twin, so the twin cannot go on with it; use --out")
-        if seed is not None and seed != int(noted):
-            raise ConfigError(f"{append}: was recorded with --seed {noted}, another seed is another telescope")
-        if config is not None and load_config(config).to_json() != store.config_json:
-            raise ConfigError(f"{append}: was recorded with another config; leave --config out to go on with its own")
+        settings, noted_seed = noted
+        if seed is not None and seed != noted_seed:
+            raise ConfigError(f"{append}: was recorded with --seed {noted_seed}, another seed is another telescope")
+        if asked is not None and (different := different_sections(asked, settings)):
+            raise ConfigError(
+                f"{append}: was recorded with another twin than {settings_file} describes (it differs in "
+                f"{', '.join(different)}); leave --twin-settings out to go on with its own"
+            )
         used = InstrumentConfig.from_json(store.config_json, f"{append}: config")
-        twin = build_twin(used, TwinSettings(), int(noted))
+        if config is not None and load_config(config) != used:
+            raise ConfigError(f"{append}: was recorded with another config; leave --config out to go on with its own")
+        twin = build_twin(used, settings, noted_seed)
         times_s = [r.star_mid_exposure_s for r in store.records() if math.isfinite(r.star_mid_exposure_s)]
         twin.update(max(times_s, default=0.0) + SESSION_GAP_S)
     else:
         assert out is not None
         used = load_config(config or "fact")
         chosen = DEFAULT_SEED if seed is None else seed
-        twin = build_twin(used, TwinSettings(), chosen)
+        settings = TwinSettings() if asked is None else asked
+        try:
+            twin = build_twin(used, settings, chosen)
+        except ConfigError as error:  # a star that does not exist, or that has not risen
+            raise ConfigError(str(error) if settings_file is None else f"{settings_file}: {error}") from None
         source = f"digital twin of {used.telescope.name}, seed {chosen}"
+        if settings_file is not None:
+            source += f", settings {settings_file.name}"
         facet_ids = [facet.id for facet in used.facets]
         store = stack.enter_context(RunStore.create(out, facet_ids, used.to_json(), source, twin.wall_clock, force))
-        store.set_note(NOTE_TWIN_SEED, str(chosen))
+        note_twin(store, settings, chosen)
     equipment = Equipment(twin.star_camera, twin.reflector_camera, twin.clock, twin.wall_clock)
-    return _Session(equipment, twin.instrument, store, twin.telescope.pass_s)
+    return _Session(equipment, twin.instrument, used, store, twin.telescope.pass_s)
 
 
 def _replay(stack: ExitStack, replay: Path, out: Path | None, *, force: bool) -> _Session:
@@ -183,12 +216,13 @@ def _replay(stack: ExitStack, replay: Path, out: Path | None, *, force: bool) ->
     with RunStore.open(replay) as old:
         found = replayable_records(old)
         star, reflector = (ReplayCamera(old, found, camera) for camera in CAMERAS)
-        instrument = with_facet_map(build_instrument(InstrumentConfig.from_json(old.config_json, f"{replay}: config")))
+        config = InstrumentConfig.from_json(old.config_json, f"{replay}: config")
+        instrument = with_facet_map(build_instrument(config))
         store = RunStore.create(out, old.facet_ids, old.config_json, f"replay of {old.path}", SystemClock(), force)
     stack.enter_context(store)
     identities = iter([(record.index, record.label) for record in found])
     equipment = Equipment(star, reflector, ReplayClock(), SystemClock())
-    return _Session(equipment, instrument, store, 0.0, identities)
+    return _Session(equipment, instrument, config, store, 0.0, identities)
 
 
 @contextmanager

@@ -149,4 +149,5 @@ def fact_response_table() -> ResponseTable:
     ids = tuple(int(path.stem.split("ID")[1].split("_")[0]) for path in paths)
     n = len(maps[0])
     theta = deg_to_rad(maps[0][:, :2])
-    return ResponseTable(ids, np.arange(n), theta, np.full(n, np.nan), np.column_stack([m[:, 2] for m in maps]), np.ones(n))
+    response = np.column_stack([m[:, 2] for m in maps])
+    return ResponseTable(ids, np.arange(n), theta, np.full(n, np.nan), response, np.ones(n))

@@ -53,7 +53,9 @@ def simulated(n_facets, n_records):
     rng = np.random.default_rng(3)
     theta = deg_to_rad(rng.normal(0.0, 0.13, (n_records, 2)))
     response = rng.random((n_records, n_facets))
-    table = ResponseTable(reflector.ids, np.arange(n_records), theta, np.full(n_records, np.nan), response, np.ones(n_records))
+    table = ResponseTable(
+        reflector.ids, np.arange(n_records), theta, np.full(n_records, np.nan), response, np.ones(n_records)
+    )
     return table, alignment
 
 
@@ -85,7 +87,9 @@ def test_the_bright_spot_of_a_map_is_where_the_star_was():
     theta = deg_to_rad(np.stack(np.meshgrid(np.arange(-9, 10), np.arange(-9, 10)), -1).reshape(-1, 2) * 0.02)
     target = deg_to_rad(np.array([0.1, -0.06]))
     response = np.where(np.linalg.norm(theta - target, axis=1) < deg_to_rad(0.03), 1.0, 0.05)[:, None]
-    table = ResponseTable((7,), np.arange(len(theta)), theta, np.full(len(theta), np.nan), response, np.ones(len(theta)))
+    table = ResponseTable(
+        (7,), np.arange(len(theta)), theta, np.full(len(theta), np.nan), response, np.ones(len(theta))
+    )
     alignment = alignment_of([facet_alignment(7, (0.1, -0.06))])
     figure = draw_psf_maps(histogram_responses(table, deg_to_rad(0.02)), table, alignment)
     canvas = FigureCanvasAgg(figure)

@@ -8,9 +8,14 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from namod_ctl.app.build_twin import build_twin, load_twin_settings
 from namod_ctl.app.commands.record import record
-from namod_ctl.core.errors import NamodError
+from namod_ctl.app.config import builtin_folder, load_config
+from namod_ctl.app.twin_note import noted_twin
+from namod_ctl.core.clock import SystemClock
+from namod_ctl.core.errors import NamodError, StoreError
 from namod_ctl.store.run import RunStore
+from namod_ctl.twin.settings import TwinSettings
 
 app = typer.Typer()
 app.command()(record)
@@ -44,6 +49,8 @@ def twin_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["--out", "{run}", "--replay", "{run}"], "stays as it is"),
         (["--replay", "{run}"], "--out"),
         (["--out", "{new}", "--replay", "{run}", "--config", "fact"], "--replay"),
+        (["--out", "{new}", "--replay", "{run}", "--twin-settings", "twin.toml"], "--replay"),
+        (["--out", "{new}", "--twin-settings", "no_such.toml"], "no such file"),
         (["--append", "{run}", "--seed", "4"], "seed 3"),
         (["--append", "{run}", "--config", "mini_fact"], "another config"),
         (["--append", "{new}"], "no run"),
@@ -56,6 +63,69 @@ def test_what_cannot_be_done_is_refused(twin_run: Path, tmp_path: Path, argument
     assert code == 2
     assert named in output
     assert not new.exists()
+
+
+MOON = "[reflector]\nmisalignment_arcmin = 2.0\n[[faults]]\nname = 'moonlight'\nparams = {level_share = 0.01}\n"
+
+
+def test_the_twin_of_a_file_is_noted_and_goes_on(tmp_path: Path) -> None:
+    """What was recorded does not depend on the file any more: neither on its text nor on its being there."""
+    moon, other, out = tmp_path / "moon.toml", tmp_path / "other.toml", tmp_path / "RUN"
+    moon.write_text(MOON)
+    other.write_text(MOON.replace("0.01", "0.02"))
+    code, output = call("--out", out, "--twin-settings", moon, "--records", 1, "--every", 0)
+    assert code == 0, output
+    with RunStore.open(out) as run:
+        assert "moon.toml" in run.source
+        noted = noted_twin(run)
+    assert noted == (load_twin_settings(moon), 1)
+    code, output = call("--append", out, "--twin-settings", other, "--records", 2, "--every", 0)
+    assert code == 2
+    assert "another twin" in output
+    assert "faults" in output
+    same = tmp_path / "same.toml"
+    moon.rename(same)
+    for arguments in ([], ["--twin-settings", same]):
+        code, output = call("--append", out, *arguments, "--records", 2, "--every", 0)
+        assert code == 0, output
+    with RunStore.open(out) as run:
+        assert noted_twin(run) == noted
+
+
+def test_a_run_that_knows_its_seed_only_is_of_the_default_twin(tmp_path: Path) -> None:
+    with RunStore.create(tmp_path / "RUN", (1,), '{"telescope": {}}', "", SystemClock()) as run:
+        assert noted_twin(run) is None
+        run.set_note("record.twin_seed", "3")
+        assert noted_twin(run) == (TwinSettings(), 3)
+        run.set_note("record.twin_settings", '{"sky": {"wind": 1}}')
+        with pytest.raises(StoreError, match="wind"):
+            noted_twin(run)
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("[sky]\nreference_star = 'Sirius'", "Sirius"),
+        ("[sky]\nreference_star = 'Nemesis'", "catalogue"),
+        ("[telescope]\nspeed = 3\n[sky]\nwind = 1", "telescope.speed"),
+        ("[telescope]\nspeed = 3\n[sky]\nwind = 1", "sky.wind"),
+    ],
+)
+def test_a_twin_that_cannot_be_is_refused_with_its_file(text: str, named: str, tmp_path: Path) -> None:
+    file, new = tmp_path / "twin.toml", tmp_path / "NEW"
+    file.write_text(text)
+    code, output = call("--out", new, "--twin-settings", file)
+    assert code == 2
+    assert "twin.toml" in output
+    assert named in output
+    assert not new.exists()
+
+
+def test_the_rough_night_that_comes_with_the_program_is_rough() -> None:
+    settings = load_twin_settings(builtin_folder() / "twin" / "rough_night.toml")
+    assert {"clouds", "clouds_total", "satellite", "moonlight"} <= {fault.name for fault in settings.faults}
+    twin = build_twin(load_config("fact"), settings, 1)
+    assert [twin.sky.star_name(time_s) for time_s in (0.0, 1385.0)] == ["Vega", "Deneb"]
 
 
 def test_without_the_flag_it_says_that_this_is_the_twin(tmp_path: Path) -> None:

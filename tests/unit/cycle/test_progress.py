@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from namod_ctl.app.terminal import coverage_lines, plain_line, steering
+from namod_ctl.app.terminal import coverage_lines, plain_line, star_brightness, steering
 from namod_ctl.core.flags import RejectReason
 from namod_ctl.core.records import Record
 from namod_ctl.cycle.coverage import N_CELLS, empty_coverage, with_record
@@ -78,6 +78,26 @@ def test_five_magnitudes_are_a_factor_of_a_hundred() -> None:
     assert math.isnan(magnitude(math.nan))
 
 
+def dimmed(progress_record: Record, by_mag: float) -> Record:
+    return replace(progress_record, star_intensity=progress_record.star_intensity * 10.0 ** (-0.4 * by_mag))
+
+
+def test_without_a_zero_point_the_magnitude_counts_from_the_brightest_of_the_run() -> None:
+    tracker = Tracker(RADIUS, 0.0)
+    tracker.add_earlier(record())
+    tracker.add(dimmed(record(), 1.2), 1.0, ALL_WELL)
+    assert told_at(tracker, 1.0).star_magnitude == pytest.approx(1.2)
+    assert star_brightness(told_at(tracker, 1.0)) == "+1.20 mag relative to the brightest of this run"
+    tracker.add(record(RejectReason.NO_STAR), 2.0, ALL_WELL)
+    assert star_brightness(told_at(tracker, 2.0)) == "not seen"
+
+
+def test_with_a_zero_point_the_magnitude_is_the_stars() -> None:
+    tracker = Tracker(RADIUS, 0.0, star_zero_point_mag=4.0)
+    tracker.add(record(), 1.0, ALL_WELL)  # an intensity of 10 is 2.5 mag
+    assert star_brightness(told_at(tracker, 1.0)) == "1.50 mag"
+
+
 def some_progress(theta_deg: tuple[float, float] = (0.1, 0.0)) -> Progress:
     tracker = Tracker(RADIUS, 0.0, n_wanted=10)
     tracker.add(record(theta_deg=theta_deg), 1.0, ALL_WELL)
@@ -105,9 +125,12 @@ def test_the_crew_is_told_where_to_bring_the_star() -> None:
 
 
 def test_a_plain_line_holds_the_numbers_and_the_warning() -> None:
-    estimate = LiveEstimate(n_records=7, worst_uncertainty_rad=math.radians(0.5 / 60.0), worst_facet_id=12, n_without=2)
+    estimate = LiveEstimate(
+        n_records=7, worst_uncertainty_rad=math.radians(0.5 / 60.0), worst_facet_id=12, unseen_facet_ids=(3, 4)
+    )
     progress = replace(some_progress(), estimate=estimate, warning="look up")
     line = plain_line(progress)
     assert "1 of 10 records" in line
-    assert "+-0.50 arcmin (facet 12, 2 facets without; 7 records)" in line
+    assert "+0.00 mag relative" in line
+    assert "+-0.50 arcmin (facet 12; 2 facets not seen; 7 records)" in line
     assert line.endswith("look up")

@@ -175,6 +175,68 @@ def test_a_telescope_that_moves_too_fast_is_told_so(path: Path) -> None:
     assert "slowly" in seen[-1].warning
 
 
+NO_STAR_AT_ALL, TEN_THOUSAND_SUNS = 1e-9, 1e4
+
+
+def lost(role: str) -> Callable[[Night], None]:
+    def lose(night: Night) -> None:
+        error = DeviceFaultError(f"fake {role} camera: does not answer")
+        getattr(night, role).fault = lambda time_s: error if time_s > 5.0 else None
+
+    return lose
+
+
+def dark(night: Night) -> None:
+    night.star_of = lambda time_s: NO_STAR_AT_ALL if time_s > 5.0 else 1.0
+
+
+def glaring(night: Night) -> None:
+    night.star_of = lambda time_s: TEN_THOUSAND_SUNS if time_s > 5.0 else 1.0
+
+
+def racing(night: Night) -> None:
+    def theta_of(time_s: float) -> np.ndarray:
+        turn = 0.1 * min(time_s, 5.0) + 2.0 * max(time_s - 5.0, 0.0)
+        return math.radians(0.1) * np.array([math.cos(turn), math.sin(turn)])
+
+    night.theta_of = theta_of
+
+
+@pytest.mark.parametrize(
+    ("trouble", "minutes", "what", "remedy"),
+    [
+        (lost("star"), 100.0, "camera lost", "cable and power"),  # time flies where nothing is rendered
+        (lost("reflector"), 100.0, "camera lost", "cable and power"),
+        (dark, 0.8, "star", "cloud"),
+        (glaring, 0.8, "saturated", "fainter star"),
+        (racing, 0.8, "moved", "more slowly"),
+    ],
+    ids=["star camera lost", "reflector camera lost", "star lost", "saturated", "too fast"],
+)
+def test_after_half_a_minute_of_trouble_the_crew_is_told_what_to_do(
+    path: Path, trouble: Callable[[Night], None], minutes: float, what: str, remedy: str
+) -> None:
+    night = Night()
+    trouble(night)
+    _, _, seen = record_night(path, night, None, replace(SETTINGS, first_exposure_s=0.3, pace_s=0.4), minutes)
+    warned = [progress for progress in seen if progress.warning]
+    assert warned, "no warning"
+    assert what in warned[-1].warning
+    assert remedy in warned[-1].warning
+    assert warned[0].elapsed_s > 34.0  # all was well for five seconds
+
+
+def test_far_apart_records_say_nothing_of_the_motion(path: Path) -> None:
+    """Between records 15 s apart the telescope may have stood still or gone in circles: none is rejected for it, and
+    what the star draws during its own exposure is for the star finder to judge."""
+
+    def fast(time_s: float) -> np.ndarray:
+        return math.radians(0.1) * np.array([math.cos(time_s), math.sin(time_s)])
+
+    records, _, _ = record_night(path, Night(fast), 8, replace(SETTINGS, first_exposure_s=0.3, pace_s=15.0))
+    assert all(record.reject_reason is not RejectReason.TELESCOPE_MOVED for record in records)
+
+
 class FullDisk:
     """A run on a disk that is full for some of the attempts to store a record."""
 
@@ -306,10 +368,28 @@ def some_progress(make: Callable[[Progress], Progress], tmp_path: Path) -> Progr
 
 def test_the_rule_of_uncertainty_waits_for_coverage(tmp_path: Path) -> None:
     rule = StopRule(uncertainty_rad=1e-4)
-    good = LiveEstimate(n_records=500, worst_uncertainty_rad=0.9e-4, worst_facet_id=1, n_without=0)
+    good = LiveEstimate(n_records=500, worst_uncertainty_rad=0.9e-4, worst_facet_id=1, unseen_facet_ids=())
     progress = some_progress(lambda p: replace(p, estimate=good), tmp_path)
     assert rule.reason_to_stop(progress) == ""
     covered = replace(progress, coverage=replace(progress.coverage, counts=np.ones_like(progress.coverage.counts)))
     assert rule.reason_to_stop(covered) != ""
     assert rule.reason_to_stop(replace(covered, estimate=replace(good, worst_uncertainty_rad=1.1e-4))) == ""
     assert rule.reason_to_stop(replace(covered, estimate=None)) == ""
+
+
+def test_facets_that_were_not_seen_hold_the_rule_up_until_the_region_is_covered(tmp_path: Path) -> None:
+    """Nothing is known of them, so they are no reason to stop; once the star was everywhere, nothing will be."""
+    rule = StopRule(uncertainty_rad=1e-4)
+    estimate = LiveEstimate(n_records=500, worst_uncertainty_rad=0.9e-4, worst_facet_id=1, unseen_facet_ids=(2, 5))
+    progress = some_progress(lambda p: replace(p, estimate=estimate), tmp_path)
+
+    def covered_to(share: float) -> Progress:
+        counts = np.ones_like(progress.coverage.counts)
+        cells = np.argwhere(progress.coverage.is_inside)
+        counts[tuple(cells[: round((1.0 - share) * len(cells))].T)] = 0
+        return replace(progress, coverage=replace(progress.coverage, counts=counts))
+
+    assert rule.reason_to_stop(covered_to(0.85)) == ""
+    assert "never seen: 2, 5" in rule.reason_to_stop(covered_to(1.0))
+    none_seen = replace(estimate, worst_uncertainty_rad=math.inf, unseen_facet_ids=(1, 2, 5))
+    assert rule.reason_to_stop(replace(covered_to(1.0), estimate=none_seen)) == ""

@@ -1,0 +1,19 @@
+"""The recorder's settings, from the instrument's config."""
+
+from __future__ import annotations
+
+from namod_ctl.app.config import InstrumentConfig
+from namod_ctl.app.config_schema import RecordingSection
+from namod_ctl.cycle.record import RecordSettings
+
+
+def build_record_settings(config: InstrumentConfig) -> RecordSettings:
+    """How a recording exposes and what it lets pass, as the config says; defaults where it does not."""
+    section = config.recording or RecordingSection()
+    return RecordSettings(
+        target_share=section.brightest_pixel_share,
+        shortest_s=section.shortest_exposure_s,
+        longest_s=section.longest_exposure_s,
+        max_motion_share=section.max_motion_share,
+        star_zero_point_mag=section.star_zero_point_mag,
+    )
