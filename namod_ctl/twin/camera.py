@@ -22,7 +22,8 @@ MIN_TORN_SHARE, MAX_TORN_SHARE = 0.2, 0.9
 class TwinCamera:
     """Renders what was exposed when it is fetched.
 
-    Start all cameras before fetching from any: fetching lets time pass, on the clock they share.
+    Start all cameras before fetching from any: fetching lets time pass, on the clock they share. `begin` is called when
+    an exposure begins.
     """
 
     def __init__(
@@ -34,6 +35,7 @@ class TwinCamera:
         render: Render,
         faults: FaultPlan,
         seed: int,
+        begin: Callable[[], None] | None = None,
     ) -> None:
         self._role = role
         self._sensor = sensor
@@ -42,6 +44,7 @@ class TwinCamera:
         self._render = render
         self._faults = faults
         self._seed = seed
+        self._begin = begin
         self._frame_id = 0
         self._running: tuple[float, float] | None = None
 
@@ -65,6 +68,8 @@ class TwinCamera:
                 f"{self.name}: an exposure of {exposure_s:g} s was asked for; "
                 f"it makes {shortest_s:g} to {longest_s:g} s"
             )
+        if self._begin is not None:
+            self._begin()
         step_s = self._sensor.settings.exposure_step_s
         self._running = (now_s, max(round(exposure_s / step_s), 1) * step_s)
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass
 
+from namod_ctl.core.drives import Leg
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.units import deg_to_rad
 from namod_ctl.twin.settings import FaultSpec
@@ -55,6 +56,62 @@ class Fault:
         """Is it a fault of this camera, "star" or "reflector"?"""
         return self.params.get("camera", camera) in (camera, "both")
 
+    def concerns_leg(self, leg: Leg) -> bool:
+        """Is it a fault of this leg?"""
+        return self.value("facet") in (leg.facet_id, EVERY_FACET) and self.value("leg") in (leg.index + 1, EVERY_LEG)
+
+    def concerns_bus(self, bus: str) -> bool:
+        """Is it a fault of this bus?"""
+        return self.params["bus"] in (bus, EVERY_BUS)
+
+
+EVERY_FACET, EVERY_LEG, EVERY_BUS = -1.0, 0.0, ""
+"""Legs are counted from 1 in faults, as people count them."""
+NO_FACET = -1.0
+WHOM: Mapping[str, Value] = {"facet": EVERY_FACET, "leg": EVERY_LEG}
+PAIR: Mapping[str, Value] = {"facet": NO_FACET, "leg": 1.0, "other_facet": NO_FACET, "other_leg": 1.0}
+
+DRIVE_CATALOGUE: Mapping[str, FaultKind] = {
+    "bit_errors": FaultKind("bits flip on a line, both ways: in a `share` of all bytes", {"bus": "", "share": 0.003}),
+    "line_noise": FaultKind(
+        "up to `count` bytes that nobody sent stand before a `share` of the answers",
+        {"bus": "", "share": 0.3, "count": 5.0},
+    ),
+    "lost_answers": FaultKind("a `share` of the answers gets lost; the drives act", {"bus": "", "share": 0.2}),
+    "lost_requests": FaultKind("a `share` of the requests gets lost on its way", {"bus": "", "share": 0.2}),
+    "slow_answers": FaultKind(
+        "a `share` of the answers comes `delay_s` late; in memory: together with the next one",
+        {"bus": "", "share": 1.0, "delay_s": 0.5},
+    ),
+    "bus_unplugged": FaultKind("a line is pulled out, and plugged in again when the fault ends", {"bus": ""}),
+    "drive_reset": FaultKind(
+        "a drive loses power for a moment: stops, forgets its position and its settings; is_in_move = 1: half way "
+        "through its next move, 0: when the fault begins",
+        {**WHOM, "is_in_move": 1.0},
+    ),
+    "stuck_leg": FaultKind("a spindle is jammed: the motor counts, nothing moves", WHOM),
+    "lost_steps": FaultKind("a motor loses a `share` of its steps", {**WHOM, "share": 0.3}),
+    "backlash_grown": FaultKind("the play between motor and leg grows by `factor`", {**WHOM, "factor": 3.0}),
+    "limit_switch": FaultKind(
+        "a limit switch reports the end of the way; end = -1 the lower, 1 the upper", {**WHOM, "end": 1.0}
+    ),
+    "supply_sag": FaultKind(
+        "more than `count` drives that move at once on a bus all lose a `share` of their steps",
+        {"bus": "", "count": 4.0, "share": 0.4},
+    ),
+    "wrong_sign": FaultKind("a leg is wired the wrong way round", {"facet": NO_FACET, "leg": 1.0}),
+    "wrong_scale": FaultKind(
+        "a leg travels `factor` times what its config says: another pitch or gear", {**WHOM, "factor": 2.0}
+    ),
+    "swapped_addresses": FaultKind("two drives have each other's addresses", PAIR),
+    "wrong_facet": FaultKind(
+        "two facets are wired to each other's drives, leg by leg", {"facet": NO_FACET, "other_facet": NO_FACET}
+    ),
+    "same_address": FaultKind(
+        "a drive has the address of another one too, not its own: both do what is asked of the other", PAIR
+    ),
+}
+"""Of drives, their lines and their wiring; `drives.TwinDrives.refuse` checks that what they name exists."""
 
 CATALOGUE: Mapping[str, FaultKind] = {
     "clouds": FaultKind(
@@ -104,6 +161,7 @@ CATALOGUE: Mapping[str, FaultKind] = {
     ),
     "clock_set_back": FaultKind("somebody sets the computer's wall clock back", {"by_s": 3600.0}),
     "camera_lost": FaultKind("a camera does not answer any more", {"camera": "reflector"}),
+    **DRIVE_CATALOGUE,
 }
 
 
@@ -148,6 +206,11 @@ class FaultPlan:
         """The faults of that name (and camera) that last at `time_s`."""
         return [fault for fault in self.of(name) if fault.is_active(time_s) and fault.concerns(camera)]
 
+    def next_change_s(self, names: Container[str], after_s: float, until_s: float) -> float:
+        """The first moment after `after_s` at which a fault of these names begins or ends; at latest `until_s`."""
+        moments = (moment for fault in self._faults if fault.name in names for moment in (fault.start_s, fault.end_s))
+        return min((moment for moment in moments if after_s < moment < until_s), default=until_s)
+
     def wall_clock_error_s(self, time_s: float) -> float:
         """By how much the wall clock is wrong."""
         return -sum(fault.value("by_s") for fault in self.active("clock_set_back", time_s))
@@ -155,7 +218,10 @@ class FaultPlan:
 
 def _refuse_wrong_value(fault: str, key: str, value: Value, default: Value) -> None:
     where = f"fault {fault!r}: {key} = {value!r}"
-    if isinstance(default, str):
+    if key == "bus":
+        if not isinstance(value, str):
+            raise ConfigError(f"{where}; it must be the name of a bus, or '' for all")
+    elif isinstance(default, str):
         if value not in ("star", "reflector", "both"):
             raise ConfigError(f"{where}; it must be 'star', 'reflector' or 'both'")
     elif isinstance(value, str) or not math.isfinite(value):

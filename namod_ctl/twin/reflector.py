@@ -26,10 +26,12 @@ SECONDS_PER_HOUR = 3600.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FacetTruth:
-    """What does not change with time, unless somebody turns bolts.
+    """What does not change with time, unless somebody turns bolts or motors turn.
 
     Attributes
     ----------
+    base_tilt_rad
+        Shape (n_facets, 2). The tilts it is the truth of; sag and drift are not in it.
     normals
         Shape (n_facets, 3).
     theta_rad
@@ -38,6 +40,7 @@ class FacetTruth:
         Shape (n_facets, 2, 2). How that moves with the facet's tilt; 2 but for obliquity.
     """
 
+    base_tilt_rad: Array
     normals: Array
     theta_rad: Array
     theta_per_tilt: Array
@@ -88,8 +91,9 @@ class TwinReflector:
         sag = np.column_stack([0.2 * draw("sag sideways"), -np.exp(0.4 * draw("sag"))])
         self._sag_rad = settings.sag_rad * sag
         self._drift_rad_per_kelvin = settings.drift_rad_per_kelvin * draw("drift", 2)
+        self._driven_tilt_rad = np.zeros((n, 2))  # by motors, since the twin began
         self._sag_zenith_rad: list[float] = []  # the zenith distance that the sag has followed to, tick by tick
-        self.truth = self._find_truth()
+        self._truth = FacetTruth(np.full((n, 2), np.nan), np.empty((n, 3)), np.empty((n, 2)), np.empty((n, 2, 2)))
 
     @property
     def ids(self) -> tuple[int, ...]:
@@ -120,9 +124,9 @@ class TwinReflector:
         moved: Array = self._sag_rad * math.sin(self._sag_zenith_rad[tick]) + self._drift_rad_per_kelvin * kelvin
         return moved
 
-    def theta_moved_rad(self, time_s: float) -> Array:
+    def theta_moved_rad(self, truth: FacetTruth, time_s: float) -> Array:
         """By how much sag and drift have moved the facets' true Theta at that moment, shape (n_facets, 2)."""
-        moved: Array = np.einsum("fab,fb->fa", self.truth.theta_per_tilt, self.moved_rad(time_s))
+        moved: Array = np.einsum("fab,fb->fa", truth.theta_per_tilt, self.moved_rad(time_s))
         return moved
 
     @property
@@ -130,21 +134,41 @@ class TwinReflector:
         return (len(self._sag_zenith_rad) - 1) * TICK_S
 
     @property
+    def base_tilt_rad(self) -> Array:
+        """Tilt of every facet without sag and drift, shape (n_facets, 2): as made, turned by hand and by motors."""
+        tilt: Array = self._base_tilt_rad + self._driven_tilt_rad
+        return tilt
+
+    @property
     def true_tilt_rad(self) -> Array:
         """Tilt of every facet at present, shape (n_facets, 2)."""
-        tilt: Array = self._base_tilt_rad + self.moved_rad(self._last_s)
+        tilt: Array = self.base_tilt_rad + self.moved_rad(self._last_s)
         return tilt
 
     @property
     def true_theta_rad(self) -> Array:
         """Star direction whose light has its centroid on the focal point at present, shape (n_facets, 2)."""
-        theta: Array = self.truth.theta_rad + self.theta_moved_rad(self._last_s)
+        truth = self.truth
+        theta: Array = truth.theta_rad + self.theta_moved_rad(truth, self._last_s)
         return theta
 
     def apply_correction(self, tilt_correction_rad: Array) -> None:
         """Turn every facet's normal by Phi, shape (n_facets, 2); NaN leaves a facet as it is."""
         self._base_tilt_rad = self._base_tilt_rad + np.nan_to_num(np.asarray(tilt_correction_rad, dtype=np.float64))
-        self.truth = self._find_truth()
+
+    def drive_legs(self, facet_id: int, travel_m: Mapping[int, float]) -> None:
+        """Say how far a facet's motors have moved its legs, by their index, along +z since the twin began.
+
+        Raises KeyError for an unknown facet or leg.
+        """
+        mount = self._mounts[facet_id]
+        legs = range(len(mount.legs_m))
+        if not set(travel_m) <= set(legs):
+            raise KeyError(f"facet {facet_id} has no legs {sorted(set(travel_m) - set(legs))}")
+        travel = np.array([travel_m.get(leg, 0.0) for leg in legs])
+        driven = self._driven_tilt_rad.copy()
+        driven[self.ids.index(facet_id)] = mount.tilt_of_travel(travel)
+        self._driven_tilt_rad = driven
 
     def move_legs(self, facet_id: int, travel_m: Array) -> None:
         """Move the legs of one facet's mount by `travel_m` (n_legs,), along +z. Raises KeyError for an unknown id."""
@@ -187,14 +211,26 @@ class TwinReflector:
         blur: Array = 2.0 * self.roughness_rad * np.linalg.norm(to_focus, axis=1)
         return blur
 
-    def _find_truth(self) -> FacetTruth:
-        normals = tilted_normals(self._config, self._base_tilt_rad)
-        theta = np.array([s.centred_theta(normal) for s, normal in zip(self.surfaces, normals, strict=True)])
-        per_tilt = np.empty((len(self.surfaces), 2, 2))
-        steps = [tilted_normals(self._config, self._base_tilt_rad + step) for step in TILT_STEP_RAD * np.eye(2)]
-        for j, surface in enumerate(self.surfaces):
+    @property
+    def truth(self) -> FacetTruth:
+        """The truth at the present base tilt."""
+        return self.truth_at(self.base_tilt_rad)
+
+    def truth_at(self, base_tilt_rad: Array) -> FacetTruth:
+        """The truth at base tilts, shape (n_facets, 2). Facets that stand as when it was last asked cost no time."""
+        known = self._truth
+        is_new = np.any(base_tilt_rad != known.base_tilt_rad, axis=1)
+        if not is_new.any():
+            return known
+        normals = tilted_normals(self._config, base_tilt_rad)
+        theta, per_tilt = known.theta_rad.copy(), known.theta_per_tilt.copy()
+        steps = [tilted_normals(self._config, base_tilt_rad + step) for step in TILT_STEP_RAD * np.eye(2)]
+        for j in np.flatnonzero(is_new):
+            surface = self.surfaces[j]
+            theta[j] = surface.centred_theta(normals[j])
             samples = surface.samples_m
             by_theta = surface.hit_slopes(samples, normals[j], theta[j]).mean(axis=0)
             by_tilt = [surface.hits(samples, step[j], theta[j]).mean(axis=0) / TILT_STEP_RAD for step in steps]
             per_tilt[j] = -np.linalg.solve(by_theta, np.column_stack(by_tilt))
-        return FacetTruth(normals, theta, per_tilt)
+        self._truth = FacetTruth(base_tilt_rad, normals, theta, per_tilt)
+        return self._truth

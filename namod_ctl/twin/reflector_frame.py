@@ -13,7 +13,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.stats import ncx2
 
 from namod_ctl.twin.randomness import generator
-from namod_ctl.twin.reflector import TwinReflector
+from namod_ctl.twin.reflector import FacetTruth, TwinReflector
 from namod_ctl.twin.sensor import Image, Sensor
 from namod_ctl.twin.sky import LightTrack
 from namod_ctl.twin.surface_map import FacetPixels
@@ -55,7 +55,14 @@ class ReflectorFrames:
         per_pixel_m2 = reflector.light_m2 / np.array([max(len(p.index), 1) for p in pixels])
         area_m2 = [s.area_m2 / len(p.index) for s, p in zip(reflector.surfaces, pixels, strict=True) if len(p.index)]
         self._pixel_light = per_pixel_m2 / np.median(area_m2)
-        self.refresh()
+        self._hits = [np.empty((2, 0), dtype=np.float32)] * len(pixels)
+        self._slopes = [np.empty((2, 2, 0), dtype=np.float32)] * len(pixels)
+        self._reach_m = np.zeros(len(pixels))
+        self._blur_m = reflector.blur_m
+        for blur_m in self._blur_m:
+            _lens_share(aperture_radius_m, float(blur_m))  # so that no exposure has to wait for it
+        self._traced: FacetTruth | None = None
+        self._trace(reflector.truth)
         rng = generator(seed, "scene")
         shape = (camera.n_rows // N_SCENE_PX + 2, camera.n_columns // N_SCENE_PX + 2)
         patches = cv2.resize(
@@ -66,33 +73,30 @@ class ReflectorFrames:
         noise_shape = (camera.n_rows + TILE_MARGIN_PX, camera.n_columns + TILE_MARGIN_PX, 3)
         self._noise = generator(seed, "noise of the reflector camera").standard_normal(noise_shape, dtype=np.float32)
 
-    def refresh(self) -> None:
-        """Trace the facets anew; needed after their tilts were corrected."""
-        self._hits, self._slopes = [], []
-        reach_m = []
-        self._blur_m = self._reflector.blur_m
-        truth = self._reflector.truth
-        for surface, pixels, normal, theta, blur_m in zip(
-            self._reflector.surfaces, self._pixels, truth.normals, truth.theta_rad, self._blur_m, strict=True
-        ):
+    def _trace(self, truth: FacetTruth) -> None:
+        """Trace the facets anew that do not stand as they were traced."""
+        if truth is self._traced:
+            return
+        is_new = np.any(truth.normals != self._traced.normals, axis=1) if self._traced is not None else slice(None)
+        for facet in np.arange(len(self._pixels))[is_new]:
+            surface, pixels = self._reflector.surfaces[facet], self._pixels[facet]
+            normal, theta = truth.normals[facet], truth.theta_rad[facet]
             if len(pixels.index):
                 hits = surface.hits(pixels.across_m, normal, theta)
                 slopes = surface.hit_slopes(pixels.across_m, normal, theta)
             else:
                 hits, slopes = np.empty((0, 2)), np.empty((0, 2, 2))
-            self._hits.append(np.ascontiguousarray(hits.T, dtype=np.float32))
-            self._slopes.append(np.ascontiguousarray(slopes.transpose(1, 2, 0), dtype=np.float32))
-            _lens_share(self._aperture_m, float(blur_m))  # so that no exposure has to wait for it
-            reach_m.append(float(np.linalg.norm(hits, axis=1).max(initial=0.0)))
-        self._reach_m = np.array(reach_m)
+            self._hits[facet] = np.ascontiguousarray(hits.T, dtype=np.float32)
+            self._slopes[facet] = np.ascontiguousarray(slopes.transpose(1, 2, 0), dtype=np.float32)
+            self._reach_m[facet] = float(np.linalg.norm(hits, axis=1).max(initial=0.0))
+        self._traced = truth
 
-    def _lit_facets(self, track: LightTrack, theta_moved_rad: Array) -> Iterator[tuple[int, NDArray[np.float32]]]:
+    def _lit_facets(self, track: LightTrack, theta_rad: Array) -> Iterator[tuple[int, NDArray[np.float32]]]:
         """The facets that a light reaches, and for each of their pixels the share of its light that meets the lens.
 
         The share is the mean over the track's steps, times its intensity. Facets that stay dark are left out.
         """
-        centres = self._reflector.truth.theta_rad + theta_moved_rad
-        away = track.theta_rad - centres[:, None]  # facet, step, axis
+        away = track.theta_rad - theta_rad[:, None]  # facet, step, axis
         disc_m = track.diameter_rad / 4.0 * self._reflector.focal_length_m  # per axis, of a uniform disc
         edges_m = self._aperture_m + REACH_SIGMA * np.hypot(self._blur_m, disc_m)
         reach_rad = (self._reach_m + edges_m) / self._reflector.focal_length_m * REACH_MARGIN
@@ -112,6 +116,7 @@ class ReflectorFrames:
     def render(
         self,
         tracks: Sequence[LightTrack],
+        truth: FacetTruth,
         theta_moved_rad: Array,
         factor: float,
         background: tuple[float, Array],
@@ -120,8 +125,10 @@ class ReflectorFrames:
     ) -> Image:
         """The image of lights that are dimmed (or brightened) by `factor`, `background` as for `StarFrames.render`.
 
-        `theta_moved_rad` (n_facets, 2) is by how much sag and drift have moved the facets since they were traced.
+        `truth` is that of the facets as they stand but for sag and drift, which move them by `theta_moved_rad`
+        (n_facets, 2). Facets that stand otherwise than in the last frame cost a little more.
         """
+        self._trace(truth)
         sensor, camera = self._sensor, self._sensor.camera
         level, slope = background
         sky = self._sky(sensor.bright_intensity * level, sensor.bright_intensity * slope)
@@ -134,7 +141,7 @@ class ReflectorFrames:
         unit = sensor.bright_intensity * factor
         shares: dict[int, NDArray[np.float32]] = {}
         for track in tracks:
-            for facet, light in self._lit_facets(track, theta_moved_rad):
+            for facet, light in self._lit_facets(track, truth.theta_rad + theta_moved_rad):
                 shares[facet] = shares[facet] + light if facet in shares else light
         for facet in sorted(shares):
             pixels = self._pixels[facet]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,8 @@ from numpy.typing import NDArray
 from namod_ctl.optics.instrument import Instrument
 from namod_ctl.twin.camera import TwinCamera
 from namod_ctl.twin.clock import ManualClock, WallClock
+from namod_ctl.twin.drive_wiring import BusWiring
+from namod_ctl.twin.drives import TwinDrives
 from namod_ctl.twin.faults import Fault, FaultPlan
 from namod_ctl.twin.reflector import TwinReflector
 from namod_ctl.twin.reflector_frame import ReflectorFrames
@@ -43,9 +46,13 @@ class Twin:
         Start both before fetching from either: they share the clock.
     reflector
         The true reflector, with the truth about it.
+    drives
+        The drives of the legs, where there are any: `wiring` says how they are wired.
     """
 
-    def __init__(self, instrument: Instrument, settings: TwinSettings, seed: int) -> None:
+    def __init__(
+        self, instrument: Instrument, settings: TwinSettings, seed: int, wiring: Sequence[BusWiring] = ()
+    ) -> None:
         self.instrument = instrument
         self.settings = settings
         self._faults = FaultPlan()
@@ -54,6 +61,7 @@ class Twin:
         self.clock = ManualClock()
         self.wall_clock = WallClock(self.clock, self._faults.wall_clock_error_s)
         self._lock = threading.Lock()
+        self.drives = TwinDrives(wiring, self.clock, self._faults, seed)
         telescope = Telescope(settings.telescope, self._faults, seed)
         self.telescope = telescope
         self.sky = Sky(settings.sky, settings.telescope, telescope, self._faults, seed)
@@ -76,11 +84,19 @@ class Twin:
             self.aperture_radius_m,
             seed,
         )
+        self._exposed_tilt_rad = self.reflector.base_tilt_rad
         self.star_camera = TwinCamera(
             "star", star_sensor, self.clock, self.update, self._render_star, self._faults, seed
         )
         self.reflector_camera = TwinCamera(
-            "reflector", reflector_sensor, self.clock, self.update, self._render_reflector, self._faults, seed
+            "reflector",
+            reflector_sensor,
+            self.clock,
+            self.update,
+            self._render_reflector,
+            self._faults,
+            seed,
+            self._expose,
         )
         self.update(0.0)
 
@@ -88,7 +104,7 @@ class Twin:
         """Let time pass until `time_s`; what has a memory (sag) follows. Nothing if that is over."""
         with self._lock:
             self.clock.advance_to_s(time_s)
-            self.reflector.update(self.clock.monotonic_s(), self.sky.zenith_distance_rad)
+            self._follow()
 
     def inject(
         self, name: str, *, start_s: float | None = None, duration_s: float | None = None, **params: float | str
@@ -98,26 +114,26 @@ class Twin:
         Raises ConfigError for a fault, a parameter or a value that does not exist.
         """
         start = self.clock.monotonic_s() if start_s is None else start_s
-        return self._faults.inject(FaultSpec(name, start, duration_s, params))
+        return self.drives.inject(FaultSpec(name, start, duration_s, params))
 
     def apply_correction(self, tilt_correction_rad: Array) -> None:
         """Turn the facets' normals by Phi, shape (n_facets, 2), in the order of `true_theta_rad`; NaN turns none."""
         self.reflector.apply_correction(tilt_correction_rad)
-        self._reflector_frames.refresh()
 
     def move_legs(self, facet_id: int, travel_m: Array) -> None:
         """Move the legs of one facet's mount, shape (n_legs,), along +z. Raises KeyError for an unknown facet."""
         self.reflector.move_legs(facet_id, travel_m)
-        self._reflector_frames.refresh()
 
     @property
     def true_theta_rad(self) -> Array:
         """Star direction whose light's centroid hits the focal point, shape (n_facets, 2), at present."""
+        self.update(self.clock.monotonic_s())
         return self.reflector.true_theta_rad
 
     @property
     def true_tilt_rad(self) -> Array:
         """Tilt of every facet, shape (n_facets, 2), at present."""
+        self.update(self.clock.monotonic_s())
         return self.reflector.true_tilt_rad
 
     def true_star_theta_rad(self, time_s: float) -> Array:
@@ -136,8 +152,26 @@ class Twin:
         facet_m = math.sqrt(self.reflector.surfaces[0].area_m2)
         factor = self.sky.scintillation(start_s, exposure_s, facet_m, rng) * self._dew("reflector", start_s)
         background = self._background("reflector", start_s + exposure_s / 2.0, self.settings.reflector_camera)
-        moved_rad = self.reflector.theta_moved_rad(start_s)
-        return self._reflector_frames.render(tracks, moved_rad, factor, background, exposure_s, rng)
+        truth = self.reflector.truth_at(self._exposed_tilt_rad)
+        moved_rad = self.reflector.theta_moved_rad(truth, start_s)
+        return self._reflector_frames.render(tracks, truth, moved_rad, factor, background, exposure_s, rng)
+
+    def _follow(self) -> None:
+        """Let sag, drives and facets follow the clock."""
+        now_s = self.clock.monotonic_s()
+        self.reflector.update(now_s, self.sky.zenith_distance_rad)
+        self.drives.update(now_s)
+        for facet_id in sorted(self.drives.take_moved()):
+            self.reflector.drive_legs(facet_id, self.drives.facet_travel_m(facet_id))
+
+    def _expose(self) -> None:
+        """The reflector camera begins: facets that are under way are seen where they are now.
+
+        Were they seen where they are when the frame is fetched, frames would depend on which camera is fetched first.
+        """
+        with self._lock:
+            self._follow()
+            self._exposed_tilt_rad = self.reflector.base_tilt_rad
 
     def _background(self, role: str, time_s: float, settings: CameraSettings) -> tuple[float, Array]:
         level, slope = self.sky.background(time_s)

@@ -1,0 +1,1 @@
+"""Hardware, and only here: transports, links and drives."""
