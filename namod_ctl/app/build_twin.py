@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from namod_ctl.optics.camera_model import CameraModel
 from namod_ctl.optics.instrument import Instrument
 from namod_ctl.optics.reflector import Reflector
 from namod_ctl.store.table_text import read_text
+from namod_ctl.twin.drive_wiring import BusWiring
 from namod_ctl.twin.faults import FaultPlan
 from namod_ctl.twin.settings import REFLECTOR_CAMERA, STAR_CAMERA, TwinSettings
 from namod_ctl.twin.surface_map import projected_outlines
@@ -98,15 +99,17 @@ def _in_radians(section: Mapping[str, Any], where: str, problems: list[str]) -> 
     return converted
 
 
-def build_twin(config: InstrumentConfig, settings: TwinSettings, seed: int) -> Twin:
+def build_twin(config: InstrumentConfig, settings: TwinSettings, seed: int, wiring: Sequence[BusWiring] = ()) -> Twin:
     """The twin of that config; `twin.instrument` has a map of facets even where the config has none.
+
+    With `wiring` (`build_twin_actuators.twin_wiring`) its facets have drives.
 
     Raises
     ------
     ConfigError
         For a star, a fault or a parameter in the settings that does not exist.
     """
-    return Twin(with_facet_map(build_instrument(config)), settings, seed)
+    return Twin(with_facet_map(build_instrument(config)), settings, seed, wiring)
 
 
 def with_facet_map(instrument: Instrument) -> Instrument:

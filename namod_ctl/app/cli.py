@@ -17,10 +17,19 @@ _COMMANDS = {
     "config": "namod_ctl.app.commands.config:app",
     "import": "namod_ctl.app.commands.imports:app",
     "record": "namod_ctl.app.commands.record:record",
+    "align": "namod_ctl.app.commands.align:align",
     "reconstruct": "namod_ctl.app.commands.reconstruct:reconstruct_run",
     "instruct": "namod_ctl.app.commands.instruct:instruct",
     "export": "namod_ctl.app.commands.export:export",
     "raytrace": "namod_ctl.app.commands.raytrace:raytrace",
+    "status": "namod_ctl.app.commands.status:status",
+    "stop": "namod_ctl.app.commands.control:stop",
+    "pause": "namod_ctl.app.commands.control:pause",
+    "resume": "namod_ctl.app.commands.control:resume",
+    "approve": "namod_ctl.app.commands.control:approve",
+    "refuse": "namod_ctl.app.commands.control:refuse",
+    "release": "namod_ctl.app.commands.control:release",
+    "done": "namod_ctl.app.commands.control:done",
 }
 
 

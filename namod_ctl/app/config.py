@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,9 @@ import numpy as np
 from pydantic import ValidationError
 
 import namod_ctl
+from namod_ctl.app.actuator_problems import actuator_problems
+from namod_ctl.app.actuator_schema import ActuatorsSection
+from namod_ctl.app.config_extends import read_extended
 from namod_ctl.app.config_problems import describe_problems
 from namod_ctl.app.config_schema import (
     FacetSection,
@@ -23,12 +25,12 @@ from namod_ctl.app.config_schema import (
 from namod_ctl.app.parts import mount_of, reflector_of
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.units import rad_to_deg
+from namod_ctl.devices.drive_maps import read_drive_map
 from namod_ctl.optics.layouts import Dish, Layout, generate_reflector, overlapping_facets
 from namod_ctl.optics.polygons import polygon_fault
 from namod_ctl.optics.reflector import Facet, FacetShape
 from namod_ctl.store.facet_lists import read_mars, read_sim_telarray
 from namod_ctl.store.facet_tables import read_facet_table, read_polygon_table
-from namod_ctl.store.table_text import read_text
 
 MAX_RADIUS_SHARE = 1.5  # of the focal length: no Cherenkov telescope is faster than F/D = 0.33
 MIN_HEIGHT_SHARE = -0.02  # of the focal length: measured dishes scatter around the vertex, not below
@@ -69,6 +71,9 @@ class InstrumentConfig(InstrumentSections):
             raise ConfigError(f"{source}: reflector: the stored config must hold its facets written out")
         if config.reflector_map is not None and config.reflector_map.polygons is None:
             raise ConfigError(f"{source}: reflector_map: the stored config must hold its polygons written out")
+        buses = config.actuators.buses if config.actuators is not None else ()
+        if any(isinstance(bus.drive_map, str) for bus in buses):
+            raise ConfigError(f"{source}: actuators: the stored config must hold its register maps written out")
         _raise_together(_contradictions(config, source))
         return config
 
@@ -107,11 +112,7 @@ def load_config(name_or_path: str | Path) -> InstrumentConfig:
         All problems together, each with file, key, value, rule and remedy.
     """
     path = find_config(name_or_path)
-    source = str(path)
-    try:
-        raw = tomllib.loads(read_text(path))
-    except (ValueError, RecursionError) as error:  # of syntax, a number of thousands of digits, endless nesting
-        raise ConfigError(f"{source}: not valid TOML: {error}") from None  # it names line and column
+    raw, source = read_extended(path, find_config)
     config = _validate(raw, source)
     problems: list[str] = []
     reflector = config.reflector
@@ -125,8 +126,11 @@ def load_config(name_or_path: str | Path) -> InstrumentConfig:
             reflector_map = _read_map(path.parent / reflector_map.polygons_file)
         except ConfigError as problem:
             problems.append(str(problem))
+    actuators = config.actuators
+    if actuators is not None:
+        actuators = _with_drive_maps(actuators, path.parent, source, problems)
     _raise_together(problems)
-    config = config.model_copy(update={"reflector": reflector, "reflector_map": reflector_map})
+    config = config.model_copy(update={"reflector": reflector, "reflector_map": reflector_map, "actuators": actuators})
     _raise_together(_contradictions(config, source))
     return config
 
@@ -216,6 +220,21 @@ def _read_map(path: Path) -> ReflectorMapSection:
     return ReflectorMapSection(polygons=tuple(polygons))
 
 
+def _with_drive_maps(actuators: ActuatorsSection, folder: Path, source: str, problems: list[str]) -> ActuatorsSection:
+    """The section with its register maps written out; those that cannot be read go into `problems`."""
+    buses = []
+    for number, bus in enumerate(actuators.buses, start=1):
+        if isinstance(bus.drive_map, str):
+            try:
+                table = read_drive_map(bus.drive_map, folder, builtin_folder() / "drives")
+            except ConfigError as problem:
+                problems.append(f"{source}: actuators.buses[{number}].drive_map: {problem}")
+            else:
+                bus = bus.model_copy(update={"drive_map": table})
+        buses.append(bus)
+    return actuators.model_copy(update={"buses": tuple(buses)})
+
+
 def _contradictions(config: InstrumentConfig, source: str) -> list[str]:
     """What is wrong between values that are plausible one by one; one text per problem."""
     ids = [facet.id for facet in config.facets]
@@ -234,6 +253,8 @@ def _contradictions(config: InstrumentConfig, source: str) -> list[str]:
     for key in config.mount.facet_orientation_deg:
         if key not in set(map(str, ids)):
             problems.append(f"{source}: mount.facet_orientation_deg.{key}: there is no facet of this id")
+    if config.actuators is not None:
+        problems += actuator_problems(config.actuators, config.mount, ids, source)
     return problems + _bad_polygons(config, set(ids), source) + _bad_target(config, source)
 
 

@@ -13,7 +13,7 @@ from pydantic_core import ErrorDetails
 # The units a key may end with, those of this program and those people write by mistake.
 LENGTH_WORDS = {"m", "mm", "cm", "um", "km", "inch", "inches", "meter", "meters", "metre", "metres"}
 ANGLE_WORDS = {"deg", "degs", "degree", "degrees", "mdeg", "rad", "mrad", "urad", "arcmin", "arcsec"}
-OTHER_WORDS = {"px", "pixel", "pixels", "s", "sec", "ms", "us", "adu", "per", "turn", "rev", "revolution"}
+OTHER_WORDS = {"px", "pixel", "pixels", "s", "s2", "sec", "ms", "us", "adu", "per", "turn", "rev", "revolution"}
 UNIT_WORDS = LENGTH_WORDS | ANGLE_WORDS | OTHER_WORDS
 
 

@@ -5,46 +5,35 @@ The ranges are wide for telescopes and narrow for units: a value in the wrong un
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from namod_ctl.app.actuator_schema import ActuatorsSection
+from namod_ctl.app.config_section import FacetId, FileName, Name, Section, within
 
-class Section(BaseModel):
-    """A section of the config: nothing unknown, no silent conversion of types, no infinite number."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
-
-
-def _within(low: float, high: float) -> Any:
-    """Limits of a number, both included."""
-    return Field(ge=low, le=high)
-
-
-Name = Annotated[str, Field(min_length=1, max_length=80)]
-FacetId = Annotated[int, _within(0, 999_999)]
-AngleDeg = Annotated[float, _within(-360.0, 360.0)]
-FacetWidthM = Annotated[float, _within(0.01, 5.0)]
-FacetFocalLengthM = Annotated[float, _within(0.1, 150.0)]
-DishRadiusM = Annotated[float, _within(0.1, 200.0)]
+AngleDeg = Annotated[float, within(-360.0, 360.0)]
+FacetWidthM = Annotated[float, within(0.01, 5.0)]
+FacetFocalLengthM = Annotated[float, within(0.1, 150.0)]
+DishRadiusM = Annotated[float, within(0.1, 200.0)]
 FacetShapeName = Literal["hexagon", "square", "round"]
 PointM = Annotated[
     tuple[
-        Annotated[float, _within(-50.0, 50.0)],
-        Annotated[float, _within(-50.0, 50.0)],
-        Annotated[float, _within(-5.0, 50.0)],
+        Annotated[float, within(-50.0, 50.0)],
+        Annotated[float, within(-50.0, 50.0)],
+        Annotated[float, within(-5.0, 50.0)],
     ],
     Field(strict=False),
 ]
-LegM = Annotated[tuple[Annotated[float, _within(-2.0, 2.0)], Annotated[float, _within(-2.0, 2.0)]], Field(strict=False)]
+LegM = Annotated[tuple[Annotated[float, within(-2.0, 2.0)], Annotated[float, within(-2.0, 2.0)]], Field(strict=False)]
 JointM = Annotated[
     tuple[
-        Annotated[float, _within(-5.0, 5.0)], Annotated[float, _within(-5.0, 5.0)], Annotated[float, _within(-5.0, 0.0)]
+        Annotated[float, within(-5.0, 5.0)], Annotated[float, within(-5.0, 5.0)], Annotated[float, within(-5.0, 0.0)]
     ],
     Field(strict=False),
 ]
 PixelXY = Annotated[
-    tuple[Annotated[float, _within(-1.0, 20_000.0)], Annotated[float, _within(-1.0, 20_000.0)]], Field(strict=False)
+    tuple[Annotated[float, within(-1.0, 20_000.0)], Annotated[float, within(-1.0, 20_000.0)]], Field(strict=False)
 ]
 
 
@@ -52,7 +41,7 @@ class TelescopeSection(Section):
     """The telescope as a whole."""
 
     name: Name
-    focal_length_m: Annotated[float, _within(0.1, 100.0)]
+    focal_length_m: Annotated[float, within(0.1, 100.0)]
 
 
 class FacetSection(Section):
@@ -69,7 +58,7 @@ class FacetSection(Section):
 class DishSection(Section):
     """The surface for facets of a sim_telarray list that comes without z."""
 
-    parabola_share: Annotated[float, _within(0.0, 1.0)]
+    parabola_share: Annotated[float, within(0.0, 1.0)]
     sphere_radius_m: DishRadiusM | None = None
 
 
@@ -78,10 +67,10 @@ class LayoutSection(Section):
 
     shape: FacetShapeName
     width_m: FacetWidthM
-    spacing_m: Annotated[float, _within(0.01, 10.0)]
-    inner_radius_m: Annotated[float, _within(0.0, 50.0)]
-    outer_radius_m: Annotated[float, _within(0.01, 50.0)]
-    parabola_share: Annotated[float, _within(0.0, 1.0)]
+    spacing_m: Annotated[float, within(0.01, 10.0)]
+    inner_radius_m: Annotated[float, within(0.0, 50.0)]
+    outer_radius_m: Annotated[float, within(0.01, 50.0)]
+    parabola_share: Annotated[float, within(0.0, 1.0)]
     sphere_radius_m: DishRadiusM | None = None
     lattice_centre: Literal["facet", "edge", "corner"] = "facet"
     facet_focal_length_m: FacetFocalLengthM | None = None
@@ -91,7 +80,7 @@ class ReflectorSection(Section):
     """The facets: written out, in a file, or generated; exactly one of the three."""
 
     facets: Annotated[tuple[FacetSection, ...] | None, Field(strict=False, min_length=1, max_length=1000)] = None
-    facets_file: Name | None = None
+    facets_file: FileName | None = None
     format: Literal["namod", "mars", "sim_telarray"] | None = None
     facet_ids: Annotated[tuple[FacetId, ...] | None, Field(strict=False, min_length=1)] = None
     dish: DishSection | None = None
@@ -116,9 +105,9 @@ class _MountSection(Section):
     """What all mounts have."""
 
     orientation_deg: AngleDeg
-    travel_limit_mm: Annotated[float, _within(0.05, 200.0)]
-    goniometer_resolution_deg: Annotated[float, _within(0.05, 90.0)]
-    backlash_um: Annotated[float, _within(0.0, 2000.0)]
+    travel_limit_mm: Annotated[float, within(0.05, 200.0)]
+    goniometer_resolution_deg: Annotated[float, within(0.05, 90.0)]
+    backlash_um: Annotated[float, within(0.0, 2000.0)]
     facet_orientation_deg: dict[str, AngleDeg] = Field(default_factory=dict)
 
 
@@ -126,8 +115,8 @@ class TripodMountSection(_MountSection):
     """Three bolts 120 degrees apart on a circle; the first at `orientation_deg` from +x towards +y."""
 
     kind: Literal["tripod"]
-    radius_m: Annotated[float, _within(0.005, 2.0)]
-    pitch_mm_per_turn: Annotated[float, _within(0.05, 20.0)]
+    radius_m: Annotated[float, within(0.005, 2.0)]
+    pitch_mm_per_turn: Annotated[float, within(0.05, 20.0)]
     turn_raises_leg: Literal["clockwise", "counterclockwise"]
 
 
@@ -141,7 +130,7 @@ class LegsMountSection(_MountSection):
     positions_m: Annotated[tuple[LegM, ...], Field(strict=False, min_length=2, max_length=12)]
     base_joints_m: Annotated[tuple[JointM, ...] | None, Field(strict=False)] = None
     has_fixed_point: bool
-    pitch_mm_per_turn: Annotated[float, _within(0.05, 20.0)] | None = None
+    pitch_mm_per_turn: Annotated[float, within(0.05, 20.0)] | None = None
     turn_raises_leg: Literal["clockwise", "counterclockwise"] | None = None
 
     @model_validator(mode="after")
@@ -162,9 +151,9 @@ MountSection = Annotated[TripodMountSection | LegsMountSection, Field(discrimina
 class RadiometricLawSection(Section):
     """log10(I) = r_resp log10(C) + r_expo log10(T in s) + r_const, C the response as a share of full scale."""
 
-    r_resp: Annotated[float, _within(0.2, 5.0)]
-    r_expo: Annotated[float, _within(-3.0, -0.2)]
-    r_const: Annotated[float, _within(-10.0, 10.0)]
+    r_resp: Annotated[float, within(0.2, 5.0)]
+    r_expo: Annotated[float, within(-3.0, -0.2)]
+    r_const: Annotated[float, within(-10.0, 10.0)]
 
 
 class _CameraSection(Section):
@@ -172,13 +161,13 @@ class _CameraSection(Section):
 
     model: Name
     serial_number: Name | None = None
-    columns: Annotated[int, _within(64, 20_000)]
-    rows: Annotated[int, _within(64, 20_000)]
+    columns: Annotated[int, within(64, 20_000)]
+    rows: Annotated[int, within(64, 20_000)]
     rotation_deg: AngleDeg
     mirrored: bool
     axis_px: PixelXY | None = None
-    full_scale_adu: Annotated[float, _within(1.0, 65_535.0)]
-    saturation_share: Annotated[float, _within(0.5, 1.0)]
+    full_scale_adu: Annotated[float, within(1.0, 65_535.0)]
+    saturation_share: Annotated[float, within(0.5, 1.0)]
     radiometric_law: RadiometricLawSection
 
     @model_validator(mode="after")
@@ -193,14 +182,14 @@ class _CameraSection(Section):
 class StarCameraSection(_CameraSection):
     """The camera that looks at the star."""
 
-    plate_scale_mdeg_per_px: Annotated[float, _within(0.05, 50.0)]
-    star_diameter_deg: Annotated[float, _within(0.001, 0.5)]
+    plate_scale_mdeg_per_px: Annotated[float, within(0.05, 50.0)]
+    star_diameter_deg: Annotated[float, within(0.001, 0.5)]
 
 
 class ReflectorCameraSection(_CameraSection):
     """The camera that looks at the facets."""
 
-    plate_scale_mdeg_per_px: Annotated[float, _within(1.0, 500.0)]
+    plate_scale_mdeg_per_px: Annotated[float, within(1.0, 500.0)]
 
 
 class PolygonSection(Section):
@@ -214,7 +203,7 @@ class ReflectorMapSection(Section):
     """Where the facets are in the reflector camera's image: written out or in a file."""
 
     polygons: Annotated[tuple[PolygonSection, ...] | None, Field(strict=False)] = None
-    polygons_file: Name | None = None
+    polygons_file: FileName | None = None
 
     @model_validator(mode="after")
     def _has_one_source(self) -> ReflectorMapSection:
@@ -229,11 +218,11 @@ class RecordingSection(Section):
     `star_zero_point_mag` is the magnitude of a star whose intensity, as records have it, is 1.
     """
 
-    brightest_pixel_share: Annotated[float, _within(0.3, 0.95)] = 0.8
-    shortest_exposure_s: Annotated[float, _within(1e-5, 60.0)] = 1e-3
-    longest_exposure_s: Annotated[float, _within(1e-3, 600.0)] = 3.0
-    max_motion_share: Annotated[float, _within(0.05, 5.0)] = 0.5
-    star_zero_point_mag: Annotated[float, _within(-50.0, 50.0)] | None = None
+    brightest_pixel_share: Annotated[float, within(0.3, 0.95)] = 0.8
+    shortest_exposure_s: Annotated[float, within(1e-5, 60.0)] = 1e-3
+    longest_exposure_s: Annotated[float, within(1e-3, 600.0)] = 3.0
+    max_motion_share: Annotated[float, within(0.05, 5.0)] = 0.5
+    star_zero_point_mag: Annotated[float, within(-50.0, 50.0)] | None = None
 
     @model_validator(mode="after")
     def _has_a_range(self) -> RecordingSection:
@@ -255,3 +244,4 @@ class InstrumentSections(Section):
     reflector_camera: ReflectorCameraSection
     reflector_map: ReflectorMapSection | None = None
     recording: RecordingSection | None = None
+    actuators: ActuatorsSection | None = None

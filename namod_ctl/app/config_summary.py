@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from namod_ctl.app.actuator_summary import actuator_rows, actuator_warnings
 from namod_ctl.app.config import InstrumentConfig
 from namod_ctl.app.config_schema import LegsMountSection, ReflectorCameraSection, StarCameraSection, TripodMountSection
 from namod_ctl.core.units import m2_to_cm2, rad_to_deg
@@ -31,6 +32,7 @@ def summarize(config: InstrumentConfig, instrument: Instrument) -> list[Summary]
     return [
         Summary(f"Telescope {config.telescope.name}", _telescope_rows(config, instrument)),
         Summary("\nMounts", _mount_rows(config, instrument)),
+        Summary("\nActuators", actuator_rows(config)),
         Summary("\nStar camera", _camera_rows(config.star_camera, instrument.star_camera)),
         Summary("\nReflector camera", _camera_rows(config.reflector_camera, instrument.reflector_camera)),
         Summary("\nMap of facets", _map_rows(instrument)),
@@ -58,7 +60,7 @@ def warnings_of(config: InstrumentConfig, instrument: Instrument) -> list[str]:
             f"the reflector is {seen_deg:.1f} deg wide as seen from the focal point, the reflector camera sees "
             f"{view_deg[0]:.1f} x {view_deg[1]:.1f} deg"
         )
-    return warnings
+    return warnings + actuator_warnings(config)
 
 
 def _telescope_rows(config: InstrumentConfig, instrument: Instrument) -> tuple[tuple[str, str], ...]:

@@ -5,25 +5,35 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, Protocol
 
 from pydantic import TypeAdapter, ValidationError
 
 from namod_ctl.core.errors import StoreError
-from namod_ctl.store.run import RunStore
 from namod_ctl.twin.settings import TwinSettings
 
 NOTE_SEED = "record.twin_seed"
 NOTE_SETTINGS = "record.twin_settings"
 
 
-def note_twin(store: RunStore, settings: TwinSettings, seed: int) -> None:
+class Notes(Protocol):
+    """A run or a campaign, which remember texts by name."""
+
+    path: Path
+
+    def note(self, key: str) -> str | None: ...
+
+    def set_note(self, key: str, text: str) -> None: ...
+
+
+def note_twin(store: Notes, settings: TwinSettings, seed: int) -> None:
     """Note the twin in the run: all its numbers, so that neither a file nor this program's defaults are needed."""
     store.set_note(NOTE_SETTINGS, json.dumps(settings, default=_plain))
     store.set_note(NOTE_SEED, str(seed))
 
 
-def noted_twin(store: RunStore) -> tuple[TwinSettings, int] | None:
+def noted_twin(store: Notes) -> tuple[TwinSettings, int] | None:
     """Settings and seed of the twin that the run was recorded with; None when it was not recorded with one.
 
     Raises

@@ -6,9 +6,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Self
 
 from namod_ctl.core.units import rad2_to_arcmin2
 from namod_ctl.reconstruction.alignment import AreaOfPsf
+from namod_ctl.store.campaign_rows import Cycle
 
 NEAR_LIMIT = 1.03
 """Of the ray-traced limit: so near to it nobody sees a difference."""
@@ -42,6 +44,14 @@ class Measurement:
 
     now: AreaOfPsf
     forecast: AreaOfPsf
+
+    @classmethod
+    def of(cls, cycle: Cycle, forecast_uncertainty_rad2: float) -> Self:
+        """The measurement that a cycle's row in the campaign remembers."""
+        return cls(
+            AreaOfPsf(cycle.a_sigma_now_rad2, cycle.a_sigma_uncertainty_rad2),
+            AreaOfPsf(cycle.a_sigma_predicted_rad2, forecast_uncertainty_rad2),
+        )
 
 
 def decide(history: Sequence[Measurement], limit_rad2: float | None, max_cycles: int) -> tuple[Decision, str]:

@@ -84,10 +84,13 @@ def plan_correction(
     return Plan(tuple(orders), tuple(turned), refused, forecast(result, turned))
 
 
-def forecast(result: Reconstruction, turned: Sequence[int]) -> AreaOfPsf:
+def forecast(
+    result: Reconstruction, turned: Sequence[int], turning_cov_rad2: Callable[[int], Array] | None = None
+) -> AreaOfPsf:
     """Area when the facets `turned` throw the centre of their light on the axis and the others stay.
 
     From each facet's light as it was measured: a facet's own figure errors, which no alignment mends, are in it.
+    `turning_cov_rad2` tells the covariance (2, 2) of Theta that turning a facet leaves behind.
     """
     seen = [
         (facet, fit)
@@ -98,6 +101,8 @@ def forecast(result: Reconstruction, turned: Sequence[int]) -> AreaOfPsf:
     is_turned = np.array([facet.facet_id in set(turned) for facet, _ in seen])
     left_rad = np.array([fit.parameters[CENTRE] for _, fit in seen]) - result.alignment.axis_rad
     left_cov = np.nan_to_num(np.array([facet.theta_cov_rad2 for facet, _ in seen]))
+    if turning_cov_rad2 is not None:
+        left_cov = left_cov + [turning_cov_rad2(facet.facet_id) for facet, _ in seen]
     cov = np.array([covariance_of_light(fit.parameters) for _, fit in seen])
     return area_predicted(light.flux, cov, np.where(is_turned[:, None], 0.0, left_rad), left_cov)
 

@@ -272,7 +272,7 @@ def _predict(
     left = np.where(is_turned[:, None], 0.0, centres.theta_rad - axis_rad) + mean_rad
     left_cov = np.nan_to_num(centres.theta_cov_rad2) + np.where(
         is_turned[:, None, None],
-        [_turning_cov(instrument.mounts[facet_id], instrument.goniometer_resolution_rad) for facet_id in facet_ids],
+        [turning_cov_rad2(instrument.mounts[facet_id], instrument.goniometer_resolution_rad) for facet_id in facet_ids],
         0.0,
     )
     light = np.where(known & np.isfinite(flux), flux, 0.0)
@@ -284,8 +284,8 @@ def _predict(
     return area_predicted(light[shine], perfect, left[shine], left_cov[shine]), AreaOfPsf(limit, 0.0)
 
 
-def _turning_cov(mount: Mount, goniometer_resolution_rad: float) -> Array:
-    """Covariance (2, 2) of Theta that turning to the goniometer's resolution leaves behind, rad^2."""
+def turning_cov_rad2(mount: Mount, goniometer_resolution_rad: float) -> Array:
+    """Covariance (2, 2) of Theta that turning to the goniometer's resolution leaves behind; 0 without bolts."""
     if mount.pitch_m_per_turn is None:
         return np.zeros((2, 2))
     step_m = mount.pitch_m_per_turn * goniometer_resolution_rad / (2.0 * np.pi)

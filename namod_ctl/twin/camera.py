@@ -24,6 +24,11 @@ class TwinCamera:
 
     Start all cameras before fetching from any: fetching lets time pass, on the clock they share. `begin` is called when
     an exposure begins.
+
+    Attributes
+    ----------
+    n_frames
+        Frames so far, with those that got lost; seeds the noise of the next.
     """
 
     def __init__(
@@ -45,7 +50,7 @@ class TwinCamera:
         self._faults = faults
         self._seed = seed
         self._begin = begin
-        self._frame_id = 0
+        self.n_frames = 0
         self._running: tuple[float, float] | None = None
 
     @property
@@ -81,8 +86,8 @@ class TwinCamera:
         self._running = None
         end_s = start_s + exposure_s
         latency_s = self._sensor.settings.latency_s
-        self._frame_id += 1
-        rng = generator(self._seed, f"frames of the {self._role} camera", self._frame_id)
+        self.n_frames += 1
+        rng = generator(self._seed, f"frames of the {self._role} camera", self.n_frames)
         if self._happens("dropped_frame", end_s, rng) or latency_s > timeout_s:
             self._update(end_s + timeout_s)
             self._refuse_lost(end_s + timeout_s)
@@ -91,14 +96,14 @@ class TwinCamera:
         self._refuse_lost(end_s + latency_s)
         torn = self._happens("torn_frame", end_s, rng)
         if torn and any(fault.value("is_reported") for fault in self._faults.active("torn_frame", end_s, self._role)):
-            raise CommunicationError(f"{self.name}: frame {self._frame_id} arrived incomplete; try again")
+            raise CommunicationError(f"{self.name}: frame {self.n_frames} arrived incomplete; try again")
         image = self._render(start_s, exposure_s, rng)
         hot = self._faults.active("hot_pixels", start_s, self._role)
         more = [(fault.number, int(fault.value("count")), fault.value("adu_per_s")) for fault in hot]
         self._sensor.shine_hot(image, exposure_s, more)
         if torn:  # what did not arrive keeps the buffer's zeros
             image[int(image.shape[0] * rng.uniform(MIN_TORN_SHARE, MAX_TORN_SHARE)) :] = 0
-        return Exposure(image, exposure_s, start_s + exposure_s / 2.0, self._frame_id)
+        return Exposure(image, exposure_s, start_s + exposure_s / 2.0, self.n_frames)
 
     def close(self) -> None:
         """Give up a running exposure."""

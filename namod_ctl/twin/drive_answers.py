@@ -7,8 +7,15 @@ from typing import TypeVar
 
 Unit = TypeVar("Unit")
 
+Heard = Callable[[bytes], None]
+"""Told every sound telegram that may change a drive, alone and whole, before the drives act on it."""
+
 Listeners = Callable[[int], Sequence[Unit]]
 """From an address to the drives that listen to it: one, none, or more when somebody set a switch wrongly."""
+
+
+def hear_nothing(telegram: bytes) -> None:
+    """Nobody keeps a record of what the drives are told."""
 
 
 def collide(answers: Sequence[bytes]) -> bytes:

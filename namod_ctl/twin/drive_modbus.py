@@ -19,7 +19,7 @@ from pymodbus.pdu.register_message import (
 )
 
 from firmware_protocols.errors import RemoteProtocolError
-from namod_ctl.twin.drive_answers import Listeners, collide
+from namod_ctl.twin.drive_answers import Heard, Listeners, collide, hear_nothing
 from namod_ctl.twin.drive_modbus_units import ModbusUnit, Refused
 
 BROADCAST = 0
@@ -29,13 +29,14 @@ TCP_HEAD = 8
 TCP_PROTOCOL = b"\x00\x00"
 MIN_TCP_LENGTH, MAX_TCP_LENGTH = 2, 254
 FUNCTIONS = (3, 4, 6, 16)
+WRITING = (6, 16)
 
 
 class ModbusRtuLine:
     """All units of one serial bus. Unit 0 is everyone, who act and are silent."""
 
-    def __init__(self, listeners: Listeners[ModbusUnit], addresses: Sequence[int]) -> None:
-        self._listeners = listeners
+    def __init__(self, listeners: Listeners[ModbusUnit], addresses: Sequence[int], heard: Heard = hear_nothing) -> None:
+        self._listeners, self._heard = listeners, heard
         self._addresses = addresses
         self._decoder = DecodePDU(True)
         self._framer = FramerRTU(self._decoder)
@@ -54,6 +55,8 @@ class ModbusRtuLine:
             if size:
                 frame = self._buffer[offset : offset + size]
                 self._buffer, offset = self._buffer[offset + size :], 0
+                if frame[1] in WRITING:
+                    self._heard(frame)
                 answers += self._answer(frame[0], frame[1:-2])
             else:
                 offset += 1
@@ -85,8 +88,8 @@ class ModbusRtuLine:
 class ModbusTcpLine:
     """All units behind one gateway."""
 
-    def __init__(self, listeners: Listeners[ModbusUnit]) -> None:
-        self._listeners = listeners
+    def __init__(self, listeners: Listeners[ModbusUnit], heard: Heard = hear_nothing) -> None:
+        self._listeners, self._heard = listeners, heard
         self._decoder = DecodePDU(True)
         self._framer = FramerSocket(self._decoder)
         self._buffer = b""
@@ -103,6 +106,8 @@ class ModbusTcpLine:
             used, address, transaction, body = self._framer.decode(self._buffer)
             if not used:
                 break
+            if body[0] in WRITING:
+                self._heard(self._buffer[:used])
             self._buffer = self._buffer[used:]
             units = self._listeners(address)
             responses = [_response(unit, self._decoder.decode(body), body) for unit in units]

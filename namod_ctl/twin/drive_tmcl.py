@@ -21,7 +21,7 @@ from firmware_protocols.tmcl import (
     firmware_value,
 )
 from namod_ctl.core.units import k_to_celsius
-from namod_ctl.twin.drive_answers import Listeners, collide
+from namod_ctl.twin.drive_answers import Heard, Listeners, collide, hear_nothing
 from namod_ctl.twin.drive_motor import DriveMotor, MotorFault
 
 HOST = 2
@@ -41,6 +41,9 @@ STORED = {
     AxisParameter.REFERENCE_SWITCH_SPEED: (2**23, 0),
 }
 """Axis parameters that are kept and change nothing here: largest value, default."""
+
+
+READING = frozenset({Command.GAP, Command.GGP, Command.GIO, Command.GET_FIRMWARE_VERSION})
 
 
 class _Refused(Exception):  # noqa: N818 - an answer, not an error
@@ -224,8 +227,10 @@ def _parameter(axis: _Axis, parameter: int) -> int:
 class TmclLine:
     """All modules of one bus."""
 
-    def __init__(self, listeners: Listeners[TmclModule], addresses: frozenset[int]) -> None:
-        self._listeners = listeners
+    def __init__(
+        self, listeners: Listeners[TmclModule], addresses: frozenset[int], heard: Heard = hear_nothing
+    ) -> None:
+        self._listeners, self._heard = listeners, heard
         self._addresses = addresses
         self._parser = RequestParser(addresses)
 
@@ -244,4 +249,7 @@ class TmclLine:
                 return answers + collide([wrong.encode() for _ in self._listeners(data[0])])
             if request is None:
                 return answers
+            is_question = request.command == Command.RFS and request.type == ReferenceSearch.STATUS
+            if request.command not in READING and not is_question:
+                self._heard(request.encode())
             answers += collide([module.answer(request) for module in self._listeners(request.module)])

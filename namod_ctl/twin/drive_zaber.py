@@ -16,7 +16,7 @@ from firmware_protocols.zaber_ascii import (
     Status,
 )
 from namod_ctl.core.units import k_to_celsius
-from namod_ctl.twin.drive_answers import Listeners, collide
+from namod_ctl.twin.drive_answers import Heard, Listeners, collide, hear_nothing
 from namod_ctl.twin.drive_motor import DriveMotor, MotorFault
 
 DEVICE_ID = 30211
@@ -232,8 +232,10 @@ def _move(axis: _Axis, kind: str, value: int) -> Callable[[], None]:
 class ZaberLine:
     """All devices of one bus."""
 
-    def __init__(self, listeners: Listeners[ZaberDevice], addresses: Sequence[int]) -> None:
-        self._listeners = listeners
+    def __init__(
+        self, listeners: Listeners[ZaberDevice], addresses: Sequence[int], heard: Heard = hear_nothing
+    ) -> None:
+        self._listeners, self._heard = listeners, heard
         self._addresses = sorted(addresses)
         self._parser = CommandParser()
 
@@ -248,5 +250,7 @@ class ZaberLine:
                 continue
             if command is None:
                 return answers
+            if not (command.words.startswith("get ") or command.words in ("", "warnings")):
+                self._heard(command.encode())
             for address in self._addresses if command.device == ALL else [command.device]:
                 answers += collide([device.answer(command, address) for device in self._listeners(address)])

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 import threading
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from namod_ctl.core.drives import Leg
 from namod_ctl.core.errors import ConfigError
@@ -25,6 +25,14 @@ from namod_ctl.twin.settings import FaultSpec
 MOTION_FAULTS = frozenset({"stuck_leg", "lost_steps", "backlash_grown", "limit_switch", "supply_sag", "drive_reset"})
 ENDLESS_MOVE_S = 1.0
 """What counts as the length of a motion whose end is not known, a search for the reference, for a reset in it."""
+NOTE_S = 1.0
+
+Journal = Callable[[float, Mapping[str, Any]], None]
+"""Told the moment (s) and what came in from outside then, in JSON's types; see `world`."""
+
+
+def keep_no_journal(time_s: float, what: Mapping[str, Any]) -> None:
+    """What comes in is forgotten with the twin."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,13 +72,16 @@ class TwinDrives:
         As the config has it; what is wrong with it are faults.
     faults, clock, seed
         The twin's.
+    journal
+        Told what comes in from outside, and the time at least every `NOTE_S` while somebody speaks.
     """
 
     def __init__(self, wiring: Sequence[BusWiring], clock: MonotonicClock, faults: FaultPlan, seed: int) -> None:
         self.wiring = {bus.name: bus for bus in wiring}
         self.faults, self.clock, self.seed = faults, clock, seed
+        self.journal: Journal = keep_no_journal
         self._lock = threading.RLock()
-        self._now_s = clock.monotonic_s()
+        self._now_s = self._noted_s = clock.monotonic_s()
         self._log: list[LogEntry] = []
         self._motors: dict[Leg, DriveMotor] = {}
         self._per_m: dict[Leg, float] = {}
@@ -99,6 +110,8 @@ class TwinDrives:
         """What the drives of a bus answer, now, to bytes that reach them all."""
         with self._lock:
             self.update(self.clock.monotonic_s())
+            if self._now_s >= self._noted_s + NOTE_S:
+                self._note({})
             return self._lines[bus].receive(data)
 
     # --- for the twin
@@ -168,7 +181,11 @@ class TwinDrives:
         with self._lock:
             self.refuse_unknown(spec)
             self.update(self.clock.monotonic_s())  # what went before goes on as it began
-            return self.faults.inject(spec)
+            fault = self.faults.inject(spec)
+            self._note(
+                {"fault": spec.name, "from_s": spec.start_s, "for_s": spec.duration_s, "params": {**spec.params}}
+            )
+            return fault
 
     def refuse_unknown(self, spec: FaultSpec) -> None:
         """Refuse a fault of a facet, leg or bus that has no drive.
@@ -234,12 +251,16 @@ class TwinDrives:
         for wire in bus.wires:
             self._legs_at[bus.name, wire.address].append(wire.leg)
         addresses = tuple(grouped)
+
+        def heard(telegram: bytes) -> None:
+            self._note({"bus": bus.name, "telegram": telegram.hex()})
+
         if bus.protocol == "tmcl":
             modules = {address: TmclModule(address, motors) for address, motors in grouped.items()}
-            return TmclLine(lambda address: self._listeners(bus, modules, address), frozenset(addresses))
+            return TmclLine(lambda address: self._listeners(bus, modules, address), frozenset(addresses), heard)
         if bus.protocol == "zaber":
             devices = {address: ZaberDevice(address, motors) for address, motors in grouped.items()}
-            return ZaberLine(lambda address: self._listeners(bus, devices, address), addresses)
+            return ZaberLine(lambda address: self._listeners(bus, devices, address), addresses, heard)
         if bus.register_map is None:
             raise ConfigError(f"bus {bus.name!r}: drives on Modbus need a register map")
         kind = unit_kind(bus.register_map)
@@ -251,8 +272,12 @@ class TwinDrives:
                 )
             units[address] = kind(address, bus.register_map, next(iter(motors.values())))
         if bus.protocol == "modbus_rtu":
-            return ModbusRtuLine(lambda address: self._listeners(bus, units, address), addresses)
-        return ModbusTcpLine(lambda address: self._listeners(bus, units, address))
+            return ModbusRtuLine(lambda address: self._listeners(bus, units, address), addresses, heard)
+        return ModbusTcpLine(lambda address: self._listeners(bus, units, address), heard)
+
+    def _note(self, what: Mapping[str, Any]) -> None:
+        self._noted_s = self._now_s
+        self.journal(self._now_s, what)
 
     def _listeners(self, bus: BusWiring, units: Mapping[int, _Unit], address: int) -> list[_Unit]:
         own_addresses = [address] if address in units else []

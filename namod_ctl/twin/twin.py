@@ -13,7 +13,7 @@ from namod_ctl.optics.instrument import Instrument
 from namod_ctl.twin.camera import TwinCamera
 from namod_ctl.twin.clock import ManualClock, WallClock
 from namod_ctl.twin.drive_wiring import BusWiring
-from namod_ctl.twin.drives import TwinDrives
+from namod_ctl.twin.drives import Journal, TwinDrives, keep_no_journal
 from namod_ctl.twin.faults import Fault, FaultPlan
 from namod_ctl.twin.reflector import TwinReflector
 from namod_ctl.twin.reflector_frame import ReflectorFrames
@@ -61,6 +61,8 @@ class Twin:
         self.clock = ManualClock()
         self.wall_clock = WallClock(self.clock, self._faults.wall_clock_error_s)
         self._lock = threading.Lock()
+        self._journal: Journal = keep_no_journal
+        self._noted = (0.0, 0, 0)
         self.drives = TwinDrives(wiring, self.clock, self._faults, seed)
         telescope = Telescope(settings.telescope, self._faults, seed)
         self.telescope = telescope
@@ -118,11 +120,21 @@ class Twin:
 
     def apply_correction(self, tilt_correction_rad: Array) -> None:
         """Turn the facets' normals by Phi, shape (n_facets, 2), in the order of `true_theta_rad`; NaN turns none."""
-        self.reflector.apply_correction(tilt_correction_rad)
+        with self._lock:
+            self.reflector.apply_correction(tilt_correction_rad)
+            tilts = [[float(t) if np.isfinite(t) else None for t in facet] for facet in tilt_correction_rad]
+            self._journal(self.clock.monotonic_s(), {"tilt_rad": tilts})
 
     def move_legs(self, facet_id: int, travel_m: Array) -> None:
         """Move the legs of one facet's mount, shape (n_legs,), along +z. Raises KeyError for an unknown facet."""
-        self.reflector.move_legs(facet_id, travel_m)
+        with self._lock:
+            self.reflector.move_legs(facet_id, travel_m)
+            travels = [float(travel) for travel in travel_m]
+            self._journal(self.clock.monotonic_s(), {"facet": facet_id, "travel_m": travels})
+
+    def keep_journal(self, journal: Journal) -> None:
+        """Tell `journal` from now on everything that comes in from outside; see `world`."""
+        self._journal = self.drives.journal = journal
 
     @property
     def true_theta_rad(self) -> Array:
@@ -163,6 +175,10 @@ class Twin:
         self.drives.update(now_s)
         for facet_id in sorted(self.drives.take_moved()):
             self.reflector.drive_legs(facet_id, self.drives.facet_travel_m(facet_id))
+        moment = (now_s, self.star_camera.n_frames, self.reflector_camera.n_frames)
+        if moment != self._noted:
+            self._noted = moment
+            self._journal(now_s, {"frames": moment[1:]})
 
     def _expose(self) -> None:
         """The reflector camera begins: facets that are under way are seen where they are now.

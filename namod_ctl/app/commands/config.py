@@ -10,6 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from namod_ctl.app.build import build_instrument
+from namod_ctl.app.build_actuators import check_ports
 from namod_ctl.app.config import builtin_names, load_config
 from namod_ctl.app.config_summary import Summary, summarize, warnings_of
 
@@ -21,12 +22,17 @@ app = typer.Typer(
 @app.command("check")
 def check(
     config: Annotated[str, typer.Argument(metavar="FILE", help="A TOML file, or a built-in name such as fact.")],
+    ports: Annotated[
+        bool, typer.Option("--ports", help="Also open the actuators' lines for a moment; nothing is sent.")
+    ] = False,
 ) -> None:
     """Validate a config and print what it says, in plain words.
 
-    Example: namod-ctl config check fact
+    Example: namod-ctl config check fact_actuated
     """
     loaded = load_config(config)
+    if ports:
+        check_ports(loaded)
     instrument = build_instrument(loaded)
     console = Console()
     for summary in summarize(loaded, instrument):

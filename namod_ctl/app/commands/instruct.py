@@ -59,20 +59,27 @@ def instruct(
     folder = out if out is not None else run
     if not folder.is_dir():
         raise ConfigError(f"{folder}: this folder does not exist; make it, or leave --out out to write into {run}")
-    instructions = facet_instructions(alignment, instrument.goniometer_resolution_rad)
-    headline = _headline(alignment, run, instructions)
     try:
-        png = figure_to_png(draw_instructions(instrument, instructions, picture, headline))
+        instructions = write_instructions(folder, alignment, instrument, picture, run.resolve().name)
     except ConfigError as error:
         raise ConfigError(f"{image if image is not None else run}: {error}") from None
+    _report(alignment, instructions, folder)
+
+
+def write_instructions(
+    folder: Path, alignment: Alignment, instrument: Instrument, picture: Image | None, name: str
+) -> tuple[FacetInstruction, ...]:
+    """Write the three files into `folder`; `name` of the run stands in their headlines. Returns what they ask for."""
+    instructions = facet_instructions(alignment, instrument.goniometer_resolution_rad)
+    headline = _headline(alignment, name, instructions)
     n_bolts = max((len(facet.bolt_turn_deg) for facet in alignment.facets), default=0)
     files = {
         CSV_FILE: instructions_to_csv(instructions, n_bolts).encode(),
-        PNG_FILE: png,
+        PNG_FILE: figure_to_png(draw_instructions(instrument, instructions, picture, headline)),
         PDF_FILE: sheets_to_pdf(instrument, instructions, headline),
     }
     write_results(folder, files)
-    _report(alignment, instructions, folder)
+    return instructions
 
 
 def read_picture(path: Path) -> Image:
@@ -130,9 +137,9 @@ def _counts(instructions: tuple[FacetInstruction, ...]) -> str:
     return ", ".join(f"{counted[verdict]} {text}" for verdict, text in words.items() if counted[verdict])
 
 
-def _headline(alignment: Alignment, run: Path, instructions: tuple[FacetInstruction, ...]) -> str:
+def _headline(alignment: Alignment, run: str, instructions: tuple[FacetInstruction, ...]) -> str:
     headline = (
-        f"{alignment.telescope}, run {run.resolve().name}: {len(instructions)} facets, {_counts(instructions)} "
+        f"{alignment.telescope}, run {run}: {len(instructions)} facets, {_counts(instructions)} "
         f"(estimator {alignment.estimator}, {alignment.n_used} of {alignment.n_records} records)"
     )
     doubtful = _resting_on_bad_records(alignment)

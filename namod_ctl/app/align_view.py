@@ -1,0 +1,129 @@
+"""What the crew sees of a campaign in a terminal: one line per step, a live panel while records come in."""
+
+from __future__ import annotations
+
+import select
+import sys
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from namod_ctl.app.terminal import TerminalView
+from namod_ctl.core.units import m_to_mm, rad2_to_arcmin2
+from namod_ctl.cycle.campaign import View
+from namod_ctl.cycle.machine import STATES
+from namod_ctl.cycle.plan import Plan
+from namod_ctl.cycle.progress import Progress
+from namod_ctl.reconstruction.reconstruct import Reconstruction
+from namod_ctl.store.campaign_rows import Cycle
+
+WAIT_S = 0.1
+MAX_REFUSED_SHOWN = 5
+
+
+class AlignView(View):
+    """Shows a campaign on a console; a context manager."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._live: TerminalView | None = None
+        self._state = ""
+        self._question = ""
+        self._answers: list[bool] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._end_live()
+
+    def state(self, state: str, reason: str) -> None:
+        """A line for every new state."""
+        if state == self._state and not reason:
+            return
+        self._end_live()
+        self._state = state
+        meaning = reason or STATES[state]
+        self._console.print(f"[bold]{state.replace('_', ' '):>17}[/bold]  {escape(meaning)}", soft_wrap=True)
+
+    def recording(self, cycle: int, progress: Progress) -> None:
+        """The recorder's own view."""
+        if self._live is None:
+            self._live = TerminalView(self._console, f"cycle {cycle}").__enter__()
+        self._live.show(progress)
+
+    def measured(self, cycle: Cycle, result: Reconstruction) -> None:
+        """The area and what follows from it."""
+        self._line(f"cycle {cycle.number}: {cycle.decision}")
+
+    def plan(self, plan: Plan) -> None:
+        """How many legs move how far, and what is refused."""
+        travels_mm = [abs(m_to_mm(order.target_m - order.start_m)) for order in plan.orders]
+        if travels_mm:
+            self._line(
+                f"{len(plan.orders)} legs of {len(plan.turned)} facets, up to {max(travels_mm):.3f} mm; predicted "
+                f"{rad2_to_arcmin2(plan.forecast.a_sigma_rad2):.2f} arcmin2"
+            )
+        else:
+            self._line(f"{len(plan.turned)} facets to turn by hand")
+        for facet_id, why in list(plan.refused.items())[:MAX_REFUSED_SHOWN]:
+            self._line(f"facet {facet_id} stays as it is: {why}")
+        if len(plan.refused) > MAX_REFUSED_SHOWN:
+            self._line(
+                f"and {len(plan.refused) - MAX_REFUSED_SHOWN} more stay as they are; namod-ctl status lists them"
+            )
+
+    def told(self, text: str) -> None:
+        """A sentence of the campaign."""
+        self._line(text)
+
+    def answer(self) -> bool | None:
+        """What the person at this terminal types: yes or no, and Enter."""
+        if not sys.stdin.isatty():
+            return None
+        if not self._question:
+            self._question = "carry it out? [y/n] (or `namod-ctl approve` elsewhere) "
+            self._console.print(self._question, end="", markup=False)
+        ready, _, _ = select.select([sys.stdin], [], [], 0.0)
+        if not ready:
+            return None
+        self._question = ""
+        return sys.stdin.readline().strip().lower() in ("y", "yes")
+
+    def wait(self) -> None:
+        """Until somebody types, or a moment is over in which requests of other terminals may have come."""
+        select.select([sys.stdin] if sys.stdin.isatty() else [], [], [], WAIT_S)
+
+    def _line(self, text: str) -> None:
+        self._end_live()
+        self._console.print(f"{'':17}  {text}", soft_wrap=True, markup=False)
+
+    def _end_live(self) -> None:
+        if self._live is not None:
+            live, self._live = self._live, None
+            live.__exit__(None, None, None)
+
+
+def cycle_table(cycles: list[Cycle]) -> Table:
+    """One row per cycle."""
+    table = Table()
+    for name in ("cycle", "records", "A_sigma / arcmin2", "predicted", "what was decided"):
+        table.add_column(name, justify="left" if name.startswith("what") else "right")
+    for cycle in cycles:
+        now, doubt, predicted = (
+            rad2_to_arcmin2(area)
+            for area in (cycle.a_sigma_now_rad2, cycle.a_sigma_uncertainty_rad2, cycle.a_sigma_predicted_rad2)
+        )
+        table.add_row(
+            str(cycle.number),
+            str(cycle.n_records),
+            f"{now:.2f} +- {doubt:.2f}",
+            f"{predicted:.2f}",
+            escape(cycle.decision),
+        )
+    return table

@@ -1,0 +1,108 @@
+"""The report of a campaign: how A_sigma went from cycle to cycle, before and after, and every facet's way."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from namod_ctl.app.alignment_files import alignment_from_json
+from namod_ctl.app.figure_style import DPI, ORANGE, SKY, figure_to_png
+from namod_ctl.app.figures import draw_psf_sum
+from namod_ctl.app.psf_panels import psf_panels
+from namod_ctl.core.units import rad2_to_arcmin2, rad_to_arcmin
+from namod_ctl.optics.instrument import Instrument
+from namod_ctl.reconstruction.reconstruct import reconstruct
+from namod_ctl.reconstruction.responses import tabulate_responses
+from namod_ctl.store.campaign import CampaignStore
+from namod_ctl.store.campaign_rows import Cycle
+from namod_ctl.store.results import write_results
+from namod_ctl.store.run import RunStore
+
+REPORT_FOLDER = "report"
+HISTORY_FILE, FACETS_FILE, SUMMARY_FILE = "a_sigma_history.png", "facets.csv", "summary.txt"
+BEFORE_FILE, AFTER_FILE = "psf_before.png", "psf_after.png"
+
+
+def write_campaign_report(store: CampaignStore, instrument: Instrument) -> None:
+    """Write the report into the campaign's folder `report`; nothing while no cycle has a result."""
+    cycles = [cycle for cycle in store.cycles() if cycle.alignment_json is not None]
+    if not cycles:
+        return
+    files = {
+        HISTORY_FILE: figure_to_png(draw_history(cycles, instrument.name)),
+        FACETS_FILE: facet_text(cycles).encode(),
+        SUMMARY_FILE: summary_text(store).encode(),
+        BEFORE_FILE: _psf_picture(store, cycles[0], instrument),
+    }
+    if len(cycles) > 1:
+        files[AFTER_FILE] = _psf_picture(store, cycles[-1], instrument)
+    folder = store.path / REPORT_FOLDER
+    folder.mkdir(exist_ok=True)
+    write_results(folder, files)
+
+
+def draw_history(cycles: list[Cycle], telescope: str) -> Figure:
+    """A_sigma of every cycle with its uncertainty, and what each cycle's correction was to make of it."""
+    figure = Figure(figsize=(7.0, 4.5), dpi=DPI, layout="constrained")
+    axes = figure.subplots()
+    numbers = [cycle.number for cycle in cycles]
+    now, doubt, predicted = (
+        rad2_to_arcmin2(np.array([getattr(cycle, name) for cycle in cycles]))
+        for name in ("a_sigma_now_rad2", "a_sigma_uncertainty_rad2", "a_sigma_predicted_rad2")
+    )
+    axes.errorbar(numbers, now, yerr=doubt, fmt="o-", color="black", capsize=4, label="measured")
+    axes.plot(np.array(numbers) + 1, predicted, "D", color=ORANGE, fillstyle="none", label="predicted before")
+    limit = rad2_to_arcmin2(cycles[-1].a_sigma_limit_rad2)
+    if math.isfinite(limit):
+        axes.axhline(limit, color=SKY, linestyle="--", label="ray-traced, mirrors without errors")
+    for number, area in zip(numbers, now, strict=True):
+        axes.annotate(f"{area:.1f}", (number, area), textcoords="offset points", xytext=(8, 6))
+    axes.set_yscale("log")
+    axes.set_xticks(range(1, numbers[-1] + 2))
+    axes.set_xlim(0.7, numbers[-1] + 1.3)
+    axes.set_xlabel("cycle")
+    axes.set_ylabel("A_sigma / arcmin$^2$")
+    axes.set_title(f"{telescope}: area of the point spread function")
+    axes.legend()
+    return figure
+
+
+def facet_text(cycles: list[Cycle]) -> str:
+    """Every facet's orientation in every cycle: facet_id, then theta_x and theta_y in arcmin and flags per cycle."""
+    alignments = [alignment_from_json(cycle.alignment_json or "", f"cycle {cycle.number}") for cycle in cycles]
+    head = ["facet_id"]
+    for cycle in cycles:
+        head += [
+            f"{name}_{cycle.number}" for name in ("theta_x_arcmin", "theta_y_arcmin", "uncertainty_arcmin", "flags")
+        ]
+    lines = [",".join(head)]
+    for facets in zip(*(alignment.facets for alignment in alignments), strict=True):
+        cells = [str(facets[0].facet_id)]
+        for facet in facets:
+            doubt_rad = math.sqrt(max(float(np.trace(facet.theta_cov_rad2)) / 2.0, 0.0))
+            numbers = [*rad_to_arcmin(facet.theta_rad), rad_to_arcmin(doubt_rad)]
+            cells += [f"{number:.3f}" if math.isfinite(number) else "" for number in numbers]
+            cells.append("|".join(facet.flags.names))
+        lines.append(",".join(cells))
+    return "\n".join(lines) + "\n"
+
+
+def summary_text(store: CampaignStore) -> str:
+    """Cycles, then everything in the journal, in plain words."""
+    lines = [f"{store.path.name}: {store.source}", f"begun {store.created_utc}, state {store.last_state()}", ""]
+    for cycle in store.cycles():
+        lines.append(
+            f"cycle {cycle.number}: {cycle.n_records} records, A_sigma {rad2_to_arcmin2(cycle.a_sigma_now_rad2):.2f} "
+            f"+- {rad2_to_arcmin2(cycle.a_sigma_uncertainty_rad2):.2f} arcmin2; {cycle.decision}"
+        )
+    lines.append("")
+    lines += [f"{event.time_utc}  {event.kind}: {event.text}" for event in store.events()]
+    return "\n".join(lines) + "\n"
+
+
+def _psf_picture(store: CampaignStore, cycle: Cycle, instrument: Instrument) -> bytes:
+    with RunStore.open(store.run_path(cycle.number)) as run:
+        result = reconstruct(tabulate_responses(run.records(), run.facet_ids), instrument)
+    return figure_to_png(draw_psf_sum(psf_panels(result, instrument), instrument.name, result.limit))

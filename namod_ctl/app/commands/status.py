@@ -1,0 +1,179 @@
+"""`namod-ctl status`: how a campaign stands, whether or not somebody works on it."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from namod_ctl.app.campaign_choice import CAMPAIGN_HELP, choose_campaign
+from namod_ctl.core.motion import MoveOutcome
+from namod_ctl.core.units import rad2_to_arcmin2
+from namod_ctl.cycle.machine import FINAL, STATES
+from namod_ctl.store.campaign import CampaignStore
+from namod_ctl.store.campaign_lock import running_pid
+from namod_ctl.store.campaign_rows import TRANSITION
+
+SCHEMA = "namod-status/1"
+N_EVENTS = 10
+
+
+def status(
+    campaign: Annotated[
+        Path | None, typer.Argument(metavar="[CAMPAIGN]", help=CAMPAIGN_HELP, show_default=False)
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print it for a program.")] = False,
+) -> None:
+    """Show how a campaign stands: its state, its cycles, what is refused, and what happened last.
+
+    Example: namod-ctl status CAMPAIGN --json
+    """
+    path = choose_campaign(campaign)
+    pid = running_pid(path)
+    with CampaignStore.open(path) as store:
+        standing = describe(store, pid)
+    if as_json:
+        typer.echo(json.dumps(standing, indent=2, allow_nan=False))
+    else:
+        _print(standing)
+
+
+def describe(store: CampaignStore, pid: int | None) -> dict[str, Any]:
+    """Everything that `status` says, as it goes into JSON; areas in square minutes of arc, unknown ones None."""
+    transition = store.last_transition()
+    state = store.last_state() or "idle"
+    turns = store.turns()
+    return {
+        "schema": SCHEMA,
+        "campaign": str(store.path),
+        "source": store.source,
+        "state": state,
+        "state_meaning": STATES.get(state, ""),
+        "reason": str(transition.data.get("reason", "")) if transition else "",
+        "since_utc": transition.time_utc if transition else store.created_utc,
+        "is_running": pid is not None,
+        "process": pid or None,
+        "next": _next(store, state, is_running=pid is not None),
+        "cycles": [
+            {
+                "cycle": cycle.number,
+                "run": cycle.run_folder,
+                "n_records": cycle.n_records,
+                "a_sigma_arcmin2": {
+                    "now": _arcmin2(cycle.a_sigma_now_rad2),
+                    "now_uncertainty": _arcmin2(cycle.a_sigma_uncertainty_rad2),
+                    "predicted_after_correction": _arcmin2(cycle.a_sigma_predicted_rad2),
+                    "limit": _arcmin2(cycle.a_sigma_limit_rad2),
+                },
+                "decision": cycle.decision,
+            }
+            for cycle in store.cycles()
+        ],
+        "refused_facets": _refused_facets(store),
+        "legs_not_arrived": _legs_not_arrived(store),
+        "turns_to_do": [turn.facet_id for turn in turns if not turn.is_done],
+        "turns_done": [turn.facet_id for turn in turns if turn.is_done],
+        "events": [
+            {"id": event.id, "time_utc": event.time_utc, "kind": event.kind, "text": event.text}
+            for event in store.events()[-N_EVENTS:]
+        ],
+    }
+
+
+def _next(store: CampaignStore, state: str, *, is_running: bool) -> str:
+    if state == "held":
+        return f"somebody looks at the telescope, then 'namod-ctl release {store.path}'"
+    if state == "awaiting_operator":
+        waiting = sum(not turns.is_done for turns in store.turns())
+        if waiting:
+            return f"bolts of {waiting} facets are turned; then 'namod-ctl done {store.path} --all' (or --facet IDS)"
+    if not is_running:
+        if state in FINAL:
+            return "nothing: it has ended"
+        return f"nobody is at work on it; 'namod-ctl align --resume {store.path}' goes on"
+    return {
+        "awaiting_approval": f"'namod-ctl approve {store.path}' or 'namod-ctl refuse {store.path}'",
+        "paused": f"'namod-ctl resume {store.path}'",
+    }.get(state, "it goes on by itself")
+
+
+def _refused_facets(store: CampaignStore) -> dict[str, str]:
+    """What the latest preview left alone, by facet id, and why."""
+    refused: dict[str, str] = {}
+    for event in store.events():
+        if event.kind == TRANSITION and event.data.get("to") == "previewing":
+            refused = {}
+        elif event.kind == "refused":
+            refused[str(event.data.get("facet_id"))] = str(event.data.get("why"))
+    return refused
+
+
+def _legs_not_arrived(store: CampaignStore) -> list[dict[str, Any]]:
+    """Orders of the latest cycle that gave any, of which it is not certain that the leg is where it should be."""
+    orders = store.orders()
+    latest = max((order.cycle for order in orders), default=0)
+    last_of_leg = {order.order.leg: order for order in orders if order.cycle == latest}
+    return [
+        {
+            "facet_id": leg.facet_id,
+            "leg": leg.index + 1,
+            "outcome": (order.result.outcome if order.result else MoveOutcome.UNKNOWN).value,
+            "detail": order.result.detail if order.result else "ordered, and not read back yet",
+        }
+        for leg, order in sorted(last_of_leg.items())
+        if order.result is None or order.result.outcome is not MoveOutcome.ARRIVED
+    ]
+
+
+def _arcmin2(area_rad2: float) -> float | None:
+    return float(rad2_to_arcmin2(area_rad2)) if math.isfinite(area_rad2) else None
+
+
+def _print(standing: Mapping[str, Any]) -> None:
+    console = Console(highlight=False, markup=False, soft_wrap=True)
+    meaning = f" ({standing['state_meaning']})" if standing["state_meaning"] else ""
+    console.print(f"{standing['campaign']}: {standing['source']}")
+    console.print(f"State:   {standing['state']}{meaning}")
+    if standing["reason"]:
+        console.print(f"Because: {standing['reason']}")
+    process = f"process {standing['process']}" if standing["process"] else "yes"
+    console.print(f"Running: {process if standing['is_running'] else 'no'}")
+    console.print(f"Next:    {standing['next']}")
+    if standing["cycles"]:
+        console.print(_cycle_table(standing["cycles"]))
+    for facet_id, why in standing["refused_facets"].items():
+        console.print(f"Refused: facet {facet_id}: {why}")
+    for leg in standing["legs_not_arrived"]:
+        console.print(f"Leg:     facet {leg['facet_id']} leg {leg['leg']}: {leg['outcome']}; {leg['detail']}")
+    if standing["turns_to_do"] or standing["turns_done"]:
+        n_done, n_to_do = len(standing["turns_done"]), len(standing["turns_to_do"])
+        to_do = f"; to do: {', '.join(map(str, standing['turns_to_do']))}" if n_to_do else ""
+        console.print(f"Bolts:   {n_done} of {n_done + n_to_do} facets done{to_do}")
+    for event in standing["events"]:
+        console.print(f"{event['time_utc'][:19]}  {event['kind']}: {event['text']}")
+
+
+def _cycle_table(cycles: list[dict[str, Any]]) -> Table:
+    table = Table("cycle", "records", "A_sigma [arcmin2]", "predicted", "limit", "decision")
+    for cycle in cycles:
+        area = cycle["a_sigma_arcmin2"]
+        spread = f" +- {area['now_uncertainty']:.2f}" if area["now_uncertainty"] is not None else ""
+        table.add_row(
+            str(cycle["cycle"]),
+            str(cycle["n_records"]),
+            _area(area["now"]) + spread,
+            _area(area["predicted_after_correction"]),
+            _area(area["limit"]),
+            cycle["decision"],
+        )
+    return table
+
+
+def _area(area_arcmin2: float | None) -> str:
+    return "-" if area_arcmin2 is None else f"{area_arcmin2:.2f}"

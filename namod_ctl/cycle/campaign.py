@@ -1,0 +1,447 @@
+"""The closed loop: record, reconstruct, correct, until the area of the point spread function has converged.
+
+What to do next is told by the state machine (`machine`); this module does it. Everything that must be remembered is
+in the campaign's store before it is done, so that a campaign can be taken up after any kill.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from namod_ctl.core.clock import Clock
+from namod_ctl.core.errors import DataQualityError, NamodError, SafetyStop
+from namod_ctl.core.motion import StopSwitch
+from namod_ctl.core.units import rad2_to_arcmin2
+from namod_ctl.cycle.control import ControlBox, Request, RequestKind
+from namod_ctl.cycle.convergence import Decision, Measurement, decide
+from namod_ctl.cycle.correct import Corrector, StopAsked
+from namod_ctl.cycle.machine import FINAL, CampaignMachine
+from namod_ctl.cycle.plan import Plan
+from namod_ctl.cycle.progress import Progress
+from namod_ctl.cycle.record import Equipment, Recorder, RecordSettings, StopRule
+from namod_ctl.optics.instrument import Instrument
+from namod_ctl.reconstruction.alignment import Alignment
+from namod_ctl.reconstruction.reconstruct import Reconstruction, reconstruct
+from namod_ctl.reconstruction.responses import tabulate_responses
+from namod_ctl.store.campaign import CampaignStore
+from namod_ctl.store.campaign_rows import Cycle
+from namod_ctl.store.run import RunStore
+
+MAX_POOR_RECORDINGS = 2
+"""So often a recording that is unusable as a whole is repeated."""
+
+MAX_CHANGED_PREVIEWS = 3
+NOTE_FORECASTS = "forecasts"
+
+
+@dataclass(frozen=True, slots=True)
+class CampaignSettings:
+    """What the crew may choose.
+
+    Attributes
+    ----------
+    n_records
+        Records per cycle.
+    max_cycles
+        Corrections at most.
+    is_asked
+        A person approves every correction before anything moves.
+    limit_rad2
+        A_sigma of these very mirrors perfectly aligned, where it is known.
+    """
+
+    record: RecordSettings
+    n_records: int = 400
+    max_cycles: int = 5
+    is_asked: bool = False
+    limit_rad2: float | None = None
+
+
+class View:
+    """What the crew sees; this one shows nothing."""
+
+    def state(self, state: str, reason: str) -> None:
+        """The campaign is in that state now."""
+
+    def recording(self, cycle: int, progress: Progress) -> None:
+        """Records are coming in."""
+
+    def measured(self, cycle: Cycle, result: Reconstruction) -> None:
+        """A cycle's point spread function is known."""
+
+    def plan(self, plan: Plan) -> None:
+        """What is about to be done."""
+
+    def told(self, text: str) -> None:
+        """Something that a person should know."""
+
+    def answer(self) -> bool | None:
+        """Whether the person at the terminal approves of the plan shown last; None: no answer yet."""
+        return None
+
+    def wait(self) -> None:
+        """Wait a moment for a person, or for a request from elsewhere."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outside:
+    """What the campaign needs from above it.
+
+    Attributes
+    ----------
+    equipment
+        Opens the cameras, anew for each recording.
+    alignment_to_json, alignment_from_json
+        The machine-readable form of an alignment; reading takes the name of the source as well.
+    write_results
+        Writes tables and pictures of a reconstruction into its run's folder.
+    """
+
+    equipment: Callable[[], Equipment]
+    alignment_to_json: Callable[[Alignment], str]
+    alignment_from_json: Callable[[str, str], Alignment]
+    write_results: Callable[[Path, Reconstruction], None]
+
+
+class Campaign:
+    """Works on a campaign that is open for writing, in one thread.
+
+    Parameters
+    ----------
+    corrector
+        Turn the facets: motors or people.
+    switch
+        Thrown by whoever wants all motion to stop.
+    """
+
+    def __init__(
+        self,
+        store: CampaignStore,
+        instrument: Instrument,
+        corrector: Corrector,
+        outside: Outside,
+        settings: CampaignSettings,
+        clock: Clock,
+        switch: StopSwitch,
+        view: View,
+    ) -> None:
+        self._store, self._instrument, self._corrector = store, instrument, corrector
+        self._outside, self._settings, self._clock = outside, settings, clock
+        self._switch, self._view = switch, view
+        self._control = ControlBox(store.path)
+        self._machine = CampaignMachine(store.last_state() or "idle", self._journal)
+        self._result: Reconstruction | None = None
+        self._plan: Plan | None = None
+        self._n_poor = self._n_changed = 0
+
+    @property
+    def state(self) -> str:
+        """Where the campaign stands."""
+        return self._machine.state
+
+    def run(self) -> str:
+        """Work until a final state; that state.
+
+        Raises
+        ------
+        StoreError, and whatever interrupts the program; all motion is stopped then and the campaign is held.
+        """
+        try:
+            self._corrector.recover(self._poll)
+            while self.state not in FINAL:
+                self._view.state(self.state, "")
+                getattr(self, f"_in_{self.state}")()
+                self._poll()
+        except StopAsked as stop:
+            self._hold(str(stop))
+        except (SafetyStop, DataQualityError) as error:
+            self._hold(str(error))
+        except BaseException as error:
+            self._hold(f"{type(error).__name__}: {error}" if str(error) else type(error).__name__)
+            raise
+        return self.state
+
+    # -- the states -------------------------------------------------------------------------------------------------
+
+    def _in_idle(self) -> None:
+        self._machine.fire("start", "asked for")
+
+    def _in_checking(self) -> None:
+        remarks = self._corrector.check()
+        for remark in remarks:
+            self._tell("check", remark)
+        self._machine.fire("ready", f"checked; {len(remarks)} remarks")
+
+    def _in_recording(self) -> None:
+        cycle = self._cycle_to_record()
+        with self._run_of(cycle) as run:
+            equipment = self._outside.equipment()
+            recorder = Recorder(equipment, self._instrument, run, self._settings.record)
+
+            def on_progress(progress: Progress) -> None:
+                self._view.recording(cycle.number, progress)
+                for request in self._requests():
+                    if request.kind is RequestKind.PAUSE:
+                        recorder.ask_to_stop()
+                        self._control.answer(request, "paused at the next record")
+                        self._machine.fire("pause", "asked for")
+                    else:
+                        self._refuse(request)
+
+            reason = recorder.record(StopRule(n_records=self._settings.n_records), on_progress)
+            n_accepted = recorder.progress().n_accepted
+        self._store.save_cycle(replace(cycle, n_records=n_accepted))
+        if self.state == "recording":
+            self._machine.fire("recorded", f"cycle {cycle.number}: {n_accepted} records, {reason}")
+
+    def _in_paused(self) -> None:
+        for request in self._requests():
+            if request.kind is RequestKind.RESUME:
+                self._control.answer(request, "recording goes on")
+                self._machine.fire("resume", "asked for")
+                return
+            self._refuse(request)
+        self._view.wait()
+
+    def _in_reconstructing(self) -> None:
+        cycle = self._store.cycles()[-1]
+        try:
+            result = self._reconstructed(cycle)
+        except DataQualityError as error:
+            self._n_poor += 1
+            if self._n_poor > MAX_POOR_RECORDINGS:
+                raise
+            self._machine.fire("poor_data", str(error))
+            return
+        self._n_poor = 0
+        for finding in self._corrector.learn(self._alignments()):
+            self._tell("finding", finding)
+        plan = self._corrector.plan(result)
+        cycle = replace(
+            cycle,
+            a_sigma_now_rad2=result.alignment.now.a_sigma_rad2,
+            a_sigma_uncertainty_rad2=result.alignment.now.uncertainty_rad2,
+            a_sigma_predicted_rad2=plan.forecast.a_sigma_rad2,
+            a_sigma_limit_rad2=self._settings.limit_rad2 or result.limit.a_sigma_rad2,
+            alignment_json=self._outside.alignment_to_json(result.alignment),
+        )
+        self._note_forecast(cycle.number, plan)
+        decision, why = decide(self._history(cycle), self._settings.limit_rad2, self._settings.max_cycles)
+        self._store.save_cycle(replace(cycle, decision=f"{decision.value}: {why}"))
+        self._view.measured(self._store.cycles()[-1], result)
+        match decision:
+            case Decision.CONVERGED:
+                self._machine.fire("converge", why)
+            case Decision.WORSE:
+                self._after_worse(why)
+            case Decision.TOO_MANY:
+                raise SafetyStop(why)
+            case Decision.CORRECT:
+                self._machine.fire("correct", why)
+
+    def _in_previewing(self) -> None:
+        result = self._result or self._reconstructed(self._store.cycles()[-1])
+        self._plan = self._corrector.plan(result)
+        number = self._store.cycles()[-1].number
+        for facet_id, why in self._plan.refused.items():
+            data = {"cycle": number, "facet_id": facet_id, "leg": None, "why": why}
+            self._store.add_event("refused", f"facet {facet_id}: {why}", data)
+        self._view.plan(self._plan)
+        if not self._plan.turned:
+            raise SafetyStop(f"no facet can be turned: {next(iter(self._plan.refused.values()), 'there are none')}")
+        if self._corrector.are_people:
+            self._machine.fire("instruct", f"{len(self._plan.turned)} facets to turn by hand")
+        elif self._settings.is_asked:
+            self._machine.fire("ask", f"{len(self._plan.orders)} legs of {len(self._plan.turned)} facets would move")
+        else:
+            self._machine.fire("approve", "approved beforehand")
+
+    def _in_awaiting_approval(self) -> None:
+        if self._plan is None:  # after a restart: what was shown then may not hold any more
+            self._in_previewing_again()
+            return
+        answer = self._view.answer()
+        for request in self._requests():
+            if request.kind in (RequestKind.APPROVE, RequestKind.REFUSE):
+                answer = request.kind is RequestKind.APPROVE
+                self._control.answer(request, "approved" if answer else "refused: nothing moves")
+            else:
+                self._refuse(request)
+        if answer is None:
+            self._view.wait()
+        elif answer:
+            self._machine.fire("approve", "approved by a person")
+        else:
+            raise SafetyStop("the correction was refused by a person; nothing has moved")
+
+    def _in_correcting(self) -> None:
+        if self._plan is None:
+            # a restart: orders on record were brought to an end by `recover`; without any, nothing has moved yet
+            cycle = self._store.cycles()[-1]
+            if self._store.orders(cycle.number):
+                self._machine.fire("corrected", "the orders of before the restart are done")
+            else:
+                self._machine.fire("changed", "restarted before anything was ordered")
+            return
+        changed = self._corrector.changed_since(self._plan)
+        if changed:
+            self._n_changed += 1
+            if self._n_changed > MAX_CHANGED_PREVIEWS:
+                raise SafetyStop(f"the drives do not stand still: {changed}")
+            self._plan = None
+            self._machine.fire("changed", changed)
+            return
+        self._n_changed = 0
+        plan, self._plan = self._plan, None
+        summary = self._corrector.carry_out(self._store.cycles()[-1].number, plan, self._poll)
+        self._machine.fire("corrected", summary)
+
+    def _in_undoing(self) -> None:
+        summary = self._corrector.undo(self._store.cycles()[-1].number, self._poll)
+        if not self._corrector.has_learned:
+            raise SafetyStop(f"the last correction made it worse and was taken back ({summary}); nobody knows why")
+        self._machine.fire("corrected", f"{summary}; what was learned may mend it")
+
+    def _in_instructing(self) -> None:
+        plan = self._plan or self._corrector.plan(self._result or self._reconstructed(self._store.cycles()[-1]))
+        cycle = self._store.cycles()[-1]
+        self._tell("instructions", self._corrector.instruct(cycle.number, self._store.run_path(cycle.number), plan))
+        self._machine.fire("wait", "sheets are written")
+
+    def _in_awaiting_operator(self) -> None:
+        for request in self._requests():
+            if request.kind is RequestKind.DONE:
+                self._control.answer(request, self._corrector.mark_done(request.facet_ids))
+            else:
+                self._refuse(request)
+        if self._corrector.is_done():
+            self._plan = None
+            self._machine.fire("done", "all facets are marked as done")
+        else:
+            self._view.wait()
+
+    # -- helpers ----------------------------------------------------------------------------------------------------
+
+    def _in_previewing_again(self) -> None:
+        raise SafetyStop("restarted while a person was asked: release, and look at the preview again")
+
+    def _after_worse(self, why: str) -> None:
+        n_undone = sum(event.kind == "undone" for event in self._store.events())
+        if n_undone or not self._corrector.can_undo:
+            raise SafetyStop(f"{why}; {'it was undone once already' if n_undone else 'people must look'}")
+        self._tell("undone", why)
+        self._machine.fire("undo", why)
+
+    def _cycle_to_record(self) -> Cycle:
+        """The cycle that the next records belong to: the last one while it has no estimate, else a new one."""
+        cycles = self._store.cycles()
+        if cycles and cycles[-1].alignment_json is None:
+            return cycles[-1]
+        number = self._store.begin_cycle()
+        return next(cycle for cycle in self._store.cycles() if cycle.number == number)
+
+    def _run_of(self, cycle: Cycle) -> RunStore:
+        path = self._store.run_path(cycle.number)
+        if path.exists():
+            return RunStore.open(path, read_only=False)
+        facet_ids = self._instrument.reflector.ids
+        source = f"cycle {cycle.number} of {self._store.path.name}"
+        return RunStore.create(path, facet_ids, self._store.config_json, source, self._clock)
+
+    def _reconstructed(self, cycle: Cycle) -> Reconstruction:
+        path = self._store.run_path(cycle.number)
+        with RunStore.open(path, read_only=False) as run:
+            result = reconstruct(tabulate_responses(run.records(), run.facet_ids), self._instrument)
+            alignment_json = self._outside.alignment_to_json(result.alignment)
+            run.save_estimate(result.alignment.estimator, alignment_json, self._clock)
+        self._outside.write_results(path, result)
+        self._result = result
+        return result
+
+    def _alignments(self) -> dict[int, Alignment]:
+        """Alignments of all cycles that have one, the present one included, by number."""
+        last = self._store.cycles()[-1].number
+        found = {
+            cycle.number: self._outside.alignment_from_json(cycle.alignment_json, f"cycle {cycle.number}")
+            for cycle in self._store.cycles()
+            if cycle.alignment_json is not None
+        }
+        assert self._result is not None
+        return found | {last: self._result.alignment}
+
+    def _note_forecast(self, number: int, plan: Plan) -> None:
+        self._store.set_note(f"{NOTE_FORECASTS}.{number}", repr(plan.forecast.uncertainty_rad2))
+
+    def _history(self, last: Cycle) -> list[Measurement]:
+        """Measurements since the campaign began, or since the last correction that was taken back."""
+        measured = [cycle for cycle in self._store.cycles() if cycle.number < last.number] + [last]
+        undone_in = {
+            int(number)
+            for event in self._store.events()
+            if event.kind == "undone_in" and isinstance(number := event.data.get("cycle"), int)
+        }
+        first = max(undone_in, default=0)
+        history = []
+        for cycle in measured:
+            if cycle.number <= first or not math.isfinite(cycle.a_sigma_now_rad2):
+                continue
+            doubt = float(self._store.note(f"{NOTE_FORECASTS}.{cycle.number}") or "nan")
+            history.append(Measurement.of(cycle, doubt))
+        return history
+
+    def _requests(self) -> list[Request]:
+        """Requests from elsewhere; one that asks to stop is obeyed here.
+
+        Raises StopAsked.
+        """
+        if self._switch.is_thrown:
+            raise StopAsked(self._switch.reason)
+        requests = self._control.poll()
+        for complaint in self._control.complaints():
+            self._tell("control", complaint)
+        stops = [request for request in requests if request.kind is RequestKind.STOP]
+        if stops:
+            self._switch.throw("stopped by `namod-ctl stop`")
+            for request in requests:
+                if request in stops:
+                    self._control.answer(request, "stopping: the campaign is held until somebody releases it")
+                else:
+                    self._control.answer(request, "not possible now: somebody has stopped it", is_accepted=False)
+            raise StopAsked(self._switch.reason)
+        return requests
+
+    def _poll(self) -> None:
+        """Look for requests where only a stop can be meant."""
+        for request in self._requests():
+            self._refuse(request)
+
+    def _refuse(self, request: Request) -> None:
+        self._control.answer(
+            request, f"not possible now: {request.kind.value} means nothing in state {self.state}", is_accepted=False
+        )
+
+    def _hold(self, reason: str) -> None:
+        """Stop all motion, then journal it: in this order, as the disk may be the trouble."""
+        self._switch.throw(reason)
+        self._corrector.stop(reason)
+        try:
+            if self.state not in FINAL:
+                self._machine.fire("hold", reason)
+                self._view.state(self.state, reason)
+        except NamodError as error:
+            self._view.told(f"this could not be journaled: {error}")
+
+    def _tell(self, kind: str, text: str) -> None:
+        self._store.add_event(kind, text)
+        self._view.told(text)
+
+    def _journal(self, source: str, trigger: str, destination: str, reason: str) -> None:
+        self._store.add_transition(source, destination, trigger, reason)
+
+
+def area_text(area_rad2: float) -> str:
+    """An area for people."""
+    return f"{rad2_to_arcmin2(area_rad2):.2f} arcmin2"

@@ -1,0 +1,136 @@
+"""Corrections by people: sheets with bolt turns, marks of what is done, and a check of it in the next cycle."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from namod_ctl.core.errors import ConfigError
+from namod_ctl.core.flags import FACET_FLAG_MEANING, FacetFlag
+from namod_ctl.core.units import rad_to_deg
+from namod_ctl.cycle.check_turns import check_last_turns
+from namod_ctl.cycle.plan import Plan, forecast
+from namod_ctl.optics.instrument import Instrument
+from namod_ctl.reconstruction.alignment import Alignment, FacetAlignment
+from namod_ctl.reconstruction.reconstruct import Reconstruction, turning_cov_rad2
+from namod_ctl.store.campaign import CampaignStore
+
+
+class ManualCorrector:
+    """Asks people to turn bolts. See `correct.Corrector`.
+
+    Parameters
+    ----------
+    write_sheets
+        Writes the instructions of an alignment into its run's folder; says for a person what is where.
+    goniometer_sigma_rad
+        How well a person sets a turn, one standard deviation.
+    on_done
+        Told of every facet that is newly marked, and its turns; the twin's bolts are turned by it.
+    """
+
+    are_people = True
+    can_undo = False
+    has_learned = False
+
+    def __init__(
+        self,
+        store: CampaignStore,
+        instrument: Instrument,
+        write_sheets: Callable[[Path, Alignment], str],
+        goniometer_sigma_rad: float,
+        on_done: Callable[[int, Sequence[float]], None] = lambda facet_id, turns_deg: None,
+    ) -> None:
+        self._store, self._instrument = store, instrument
+        self._write_sheets, self._goniometer_sigma_rad = write_sheets, goniometer_sigma_rad
+        self._on_done = on_done
+        self._result: Reconstruction | None = None
+
+    def check(self) -> list[str]:
+        """People are there or not; nobody can be asked."""
+        return []
+
+    def recover(self, poll: Callable[[], None]) -> None:
+        """Turns asked for are on record; there is nothing to read back."""
+
+    def learn(self, alignments: Mapping[int, Alignment]) -> list[str]:
+        """Facet by facet, whether the turns that were asked for are what was done."""
+        if len(alignments) < 2:
+            return []
+        before, after = (alignments[number] for number in sorted(alignments)[-2:])
+        asked = {turns.facet_id: np.array(turns.turns_deg) for turns in self._store.turns(sorted(alignments)[-2])}
+        return check_last_turns(self._instrument.mounts, asked, before, after, self._goniometer_sigma_rad)
+
+    def plan(self, result: Reconstruction) -> Plan:
+        """Facets that people are to turn; their turns follow in `instruct`."""
+        self._result = result
+        turned, refused = [], {}
+        for facet in result.alignment.facets:
+            if (
+                facet.flags.forbids_turning
+                or not np.isfinite(facet.bolt_turn_deg).all()
+                or not len(facet.bolt_turn_deg)
+            ):
+                refused[facet.facet_id] = _reason(facet)
+            elif np.any(self._rounded_deg(facet)):
+                turned.append(facet.facet_id)
+        return Plan((), tuple(turned), refused, forecast(result, turned, self._turning_cov_rad2))
+
+    def changed_since(self, plan: Plan) -> str:
+        """People see for themselves."""
+        return ""
+
+    def carry_out(self, cycle: int, plan: Plan, poll: Callable[[], None]) -> str:
+        """No motors here: a bug of the caller."""
+        raise NotImplementedError
+
+    def undo(self, cycle: int, poll: Callable[[], None]) -> str:
+        """No motors here: a bug of the caller."""
+        raise NotImplementedError
+
+    def instruct(self, cycle: int, run: Path, plan: Plan) -> str:
+        """Write the sheets and journal the turns that are asked for, rounded as a goniometer can set them."""
+        assert self._result is not None
+        facets = {facet.facet_id: facet for facet in self._result.alignment.facets}
+        turns = {facet_id: self._rounded_deg(facets[facet_id]).tolist() for facet_id in plan.turned}
+        self._store.ask_turns(cycle, turns)
+        return self._write_sheets(run, self._result.alignment)
+
+    def mark_done(self, facet_ids: Sequence[int] | Literal["all"]) -> str:
+        """Mark facets; the answer says how many are left."""
+        try:
+            newly = self._store.mark_done(None if facet_ids == "all" else [int(facet_id) for facet_id in facet_ids])
+        except ConfigError as error:
+            return str(error)
+        asked = {turns.facet_id: turns.turns_deg for turns in self._store.turns()}
+        for facet_id in newly:
+            self._on_done(facet_id, asked[facet_id])
+        left = [turns.facet_id for turns in self._store.turns() if not turns.is_done]
+        rest = "all are done" if not left else f"{len(left)} to go: {', '.join(map(str, left))}"
+        return f"{len(newly)} facets marked; {rest}"
+
+    def is_done(self) -> bool:
+        """Are all facets that were asked for marked?"""
+        return all(turns.is_done for turns in self._store.turns())
+
+    def stop(self, reason: str) -> None:
+        """Nothing moves by itself."""
+
+    def _turning_cov_rad2(self, facet_id: int) -> NDArray[np.float64]:
+        return turning_cov_rad2(self._instrument.mounts[facet_id], self._instrument.goniometer_resolution_rad)
+
+    def _rounded_deg(self, facet: FacetAlignment) -> NDArray[np.float64]:
+        step_deg = rad_to_deg(self._instrument.goniometer_resolution_rad)
+        return np.asarray(np.round(facet.bolt_turn_deg / step_deg) * step_deg)
+
+
+def _reason(facet: FacetAlignment) -> str:
+    names = [flag for flag in FacetFlag if flag & facet.flags and flag.forbids_turning]
+    return (
+        "; ".join(f"{flag.name}: {FACET_FLAG_MEANING[flag]}" for flag in names)
+        or "it has no bolts, or no turn is known"
+    )
