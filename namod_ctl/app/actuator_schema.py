@@ -21,7 +21,7 @@ AXES = {"tmcl": (0, 5), "zaber": (1, 9), "modbus_rtu": (0, 0), "modbus_tcp": (0,
 LOOPBACK = "loopback://"
 SOCKET = "socket://"
 NETWORK = (SOCKET, "rfc2217://")
-_SERIAL_PORT = re.compile(r"/dev/\S+|COM[0-9]+")
+_SERIAL_PORT = re.compile(r"/\S+|COM[0-9]+")
 BusName = Annotated[str, Field(pattern=r"^\w[\w .+-]*$", max_length=40)]
 _URL_FORMS = "/dev/ttyUSB0, COM3, socket://host:port, rfc2217://host:port, or loopback://name for the twin"
 

@@ -12,7 +12,7 @@ from rich.text import Text
 from namod_ctl.core.drives import DriveState, Leg
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.motion import MoveOrder, MoveOutcome, MoveResult
-from namod_ctl.core.units import k_to_celsius, m_to_mm, m_to_um
+from namod_ctl.core.units import k_to_celsius, m_to_mm
 from namod_ctl.cycle.selftest import LegTest
 
 _LEG = re.compile(r"(?P<facet>[0-9]+)(\.(?P<leg>[0-9]+))?")
@@ -106,11 +106,11 @@ def table_of_words(title: str, words: Mapping[Leg, str]) -> Table:
 
 def table_of_tests(tests: Sequence[LegTest]) -> Table:
     """What the self-test found."""
-    table = _table("leg", "out um", "back um", "watched", "result", "identity")
+    table = _table("leg", "out by mm", "back by mm", "watched", "result", "identity")
     for test in tests:
         result = Text("passed", style="green") if test.has_passed else Text("; ".join(test.problems), style="red")
         table.add_row(
-            short_name(test.leg), _um(test.out_m), _um(test.back_m), str(test.n_watched), result, test.identity or "-"
+            short_name(test.leg), _mm(test.out_m), _mm(test.back_m), str(test.n_watched), result, test.identity or "-"
         )
     return table
 
@@ -118,13 +118,9 @@ def table_of_tests(tests: Sequence[LegTest]) -> Table:
 def _table(*columns: str) -> Table:
     table = Table(box=None, pad_edge=False)
     for column in columns:
-        table.add_column(column, justify="right" if column.endswith((" mm", " um")) else "left", overflow="fold")
+        table.add_column(column, justify="right" if column.endswith(" mm") else "left", overflow="fold")
     return table
 
 
 def _mm(length_m: float) -> str:
     return "-" if math.isnan(length_m) else f"{m_to_mm(length_m):.4f}"
-
-
-def _um(length_m: float) -> str:
-    return "-" if math.isnan(length_m) else f"{m_to_um(length_m):+.1f}"

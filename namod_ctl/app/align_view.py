@@ -13,7 +13,7 @@ from rich.table import Table
 
 from namod_ctl.app.terminal import TerminalView
 from namod_ctl.core.units import m_to_mm, rad2_to_arcmin2
-from namod_ctl.cycle.campaign import View
+from namod_ctl.cycle.campaign_parts import View
 from namod_ctl.cycle.machine import STATES
 from namod_ctl.cycle.plan import Plan
 from namod_ctl.cycle.progress import Progress

@@ -92,11 +92,11 @@ def facet_text(cycles: list[Cycle]) -> str:
 def summary_text(store: CampaignStore) -> str:
     """Cycles, then everything in the journal, in plain words."""
     lines = [f"{store.path.name}: {store.source}", f"begun {store.created_utc}, state {store.last_state()}", ""]
-    for cycle in store.cycles():
-        lines.append(
-            f"cycle {cycle.number}: {cycle.n_records} records, A_sigma {rad2_to_arcmin2(cycle.a_sigma_now_rad2):.2f} "
-            f"+- {rad2_to_arcmin2(cycle.a_sigma_uncertainty_rad2):.2f} arcmin2; {cycle.decision}"
-        )
+    lines += [
+        f"cycle {cycle.number}: {cycle.n_records} records, A_sigma {rad2_to_arcmin2(cycle.a_sigma_now_rad2):.2f} "
+        f"+- {rad2_to_arcmin2(cycle.a_sigma_uncertainty_rad2):.2f} arcmin2; {cycle.decision}"
+        for cycle in store.cycles()
+    ]
     lines.append("")
     lines += [f"{event.time_utc}  {event.kind}: {event.text}" for event in store.events()]
     return "\n".join(lines) + "\n"

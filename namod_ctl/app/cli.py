@@ -18,6 +18,7 @@ _COMMANDS = {
     "import": "namod_ctl.app.commands.imports:app",
     "record": "namod_ctl.app.commands.record:record",
     "align": "namod_ctl.app.commands.align:align",
+    "actuators": "namod_ctl.app.commands.actuators:app",
     "reconstruct": "namod_ctl.app.commands.reconstruct:reconstruct_run",
     "instruct": "namod_ctl.app.commands.instruct:instruct",
     "export": "namod_ctl.app.commands.export:export",

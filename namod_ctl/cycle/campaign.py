@@ -7,21 +7,19 @@ in the campaign's store before it is done, so that a campaign can be taken up af
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 
 from namod_ctl.core.clock import Clock
 from namod_ctl.core.errors import DataQualityError, NamodError, SafetyStop
 from namod_ctl.core.motion import StopSwitch
-from namod_ctl.core.units import rad2_to_arcmin2
+from namod_ctl.cycle.campaign_parts import CampaignSettings, Outside, View
 from namod_ctl.cycle.control import ControlBox, Request, RequestKind
 from namod_ctl.cycle.convergence import Decision, Measurement, decide
 from namod_ctl.cycle.correct import Corrector, StopAsked
 from namod_ctl.cycle.machine import FINAL, CampaignMachine
 from namod_ctl.cycle.plan import Plan
 from namod_ctl.cycle.progress import Progress
-from namod_ctl.cycle.record import Equipment, Recorder, RecordSettings, StopRule
+from namod_ctl.cycle.record import Recorder, StopRule
 from namod_ctl.optics.instrument import Instrument
 from namod_ctl.reconstruction.alignment import Alignment
 from namod_ctl.reconstruction.reconstruct import Reconstruction, reconstruct
@@ -36,74 +34,8 @@ MAX_POOR_RECORDINGS = 2
 MAX_CHANGED_PREVIEWS = 3
 NOTE_FORECASTS = "forecasts"
 
-
-@dataclass(frozen=True, slots=True)
-class CampaignSettings:
-    """What the crew may choose.
-
-    Attributes
-    ----------
-    n_records
-        Records per cycle.
-    max_cycles
-        Corrections at most.
-    is_asked
-        A person approves every correction before anything moves.
-    limit_rad2
-        A_sigma of these very mirrors perfectly aligned, where it is known.
-    """
-
-    record: RecordSettings
-    n_records: int = 400
-    max_cycles: int = 5
-    is_asked: bool = False
-    limit_rad2: float | None = None
-
-
-class View:
-    """What the crew sees; this one shows nothing."""
-
-    def state(self, state: str, reason: str) -> None:
-        """The campaign is in that state now."""
-
-    def recording(self, cycle: int, progress: Progress) -> None:
-        """Records are coming in."""
-
-    def measured(self, cycle: Cycle, result: Reconstruction) -> None:
-        """A cycle's point spread function is known."""
-
-    def plan(self, plan: Plan) -> None:
-        """What is about to be done."""
-
-    def told(self, text: str) -> None:
-        """Something that a person should know."""
-
-    def answer(self) -> bool | None:
-        """Whether the person at the terminal approves of the plan shown last; None: no answer yet."""
-        return None
-
-    def wait(self) -> None:
-        """Wait a moment for a person, or for a request from elsewhere."""
-
-
-@dataclass(frozen=True, slots=True)
-class Outside:
-    """What the campaign needs from above it.
-
-    Attributes
-    ----------
-    equipment
-        Opens the cameras, anew for each recording.
-    alignment_to_json, alignment_from_json
-        The machine-readable form of an alignment; reading takes the name of the source as well.
-    write_results
-        Writes tables and pictures of a reconstruction into its run's folder.
-    """
-
-    equipment: Callable[[], Equipment]
-    alignment_to_json: Callable[[Alignment], str]
-    alignment_from_json: Callable[[str, str], Alignment]
-    write_results: Callable[[Path, Reconstruction], None]
+LISTENING = frozenset({"recording", "paused", "awaiting_approval", "awaiting_operator"})
+"""States that answer requests themselves."""
 
 
 class Campaign:
@@ -152,9 +84,11 @@ class Campaign:
         try:
             self._corrector.recover(self._poll)
             while self.state not in FINAL:
-                self._view.state(self.state, "")
-                getattr(self, f"_in_{self.state}")()
-                self._poll()
+                state = self.state
+                self._view.state(state, "")
+                getattr(self, f"_in_{state}")()
+                if state not in LISTENING:
+                    self._poll()
         except StopAsked as stop:
             self._hold(str(stop))
         except (SafetyStop, DataQualityError) as error:
@@ -440,8 +374,3 @@ class Campaign:
 
     def _journal(self, source: str, trigger: str, destination: str, reason: str) -> None:
         self._store.add_transition(source, destination, trigger, reason)
-
-
-def area_text(area_rad2: float) -> str:
-    """An area for people."""
-    return f"{rad2_to_arcmin2(area_rad2):.2f} arcmin2"

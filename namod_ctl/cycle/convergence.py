@@ -57,8 +57,8 @@ class Measurement:
 def decide(history: Sequence[Measurement], limit_rad2: float | None, max_cycles: int) -> tuple[Decision, str]:
     """The decision after the last of the measurements, and why, for a person.
 
-    `limit_rad2` is the area of these facets perfectly aligned where it is known, by ray tracing of measured mirrors; that
-    of mirrors without errors is no such limit, as real ones never reach it.
+    `limit_rad2` is the area of these facets perfectly aligned where it is known, by ray tracing of measured
+    mirrors; that of mirrors without errors is no such limit, as real ones never reach it.
     """
     last = history[-1]
     area, doubt = last.now.a_sigma_rad2, last.now.uncertainty_rad2

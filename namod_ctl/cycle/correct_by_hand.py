@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.flags import FACET_FLAG_MEANING, FacetFlag
 from namod_ctl.core.units import rad_to_deg
-from namod_ctl.cycle.check_turns import check_last_turns
+from namod_ctl.cycle.manual import TurnKind, check_turns
 from namod_ctl.cycle.plan import Plan, forecast
 from namod_ctl.optics.instrument import Instrument
 from namod_ctl.reconstruction.alignment import Alignment, FacetAlignment
@@ -63,7 +63,16 @@ class ManualCorrector:
             return []
         before, after = (alignments[number] for number in sorted(alignments)[-2:])
         asked = {turns.facet_id: np.array(turns.turns_deg) for turns in self._store.turns(sorted(alignments)[-2])}
-        return check_last_turns(self._instrument.mounts, asked, before, after, self._goniometer_sigma_rad)
+        if not asked:
+            return []
+        was, is_now = (
+            {facet.facet_id: (facet.theta_rad, facet.theta_cov_rad2) for facet in alignment.facets}
+            for alignment in (before, after)
+        )
+        findings = check_turns(self._instrument.mounts, asked, was, is_now, self._goniometer_sigma_rad)
+        n_right = sum(finding.kind is TurnKind.RIGHT for finding in findings)
+        summary = f"{n_right} of {len(asked)} facets were turned as asked"
+        return [summary, *(finding.sentence for finding in findings if finding.kind.is_mistake)]
 
     def plan(self, result: Reconstruction) -> Plan:
         """Facets that people are to turn; their turns follow in `instruct`."""

@@ -20,7 +20,7 @@ from namod_ctl.cycle.learned_wiring import LearnedWiring
 from namod_ctl.cycle.mover import Mover
 from namod_ctl.cycle.plan import Plan, plan_correction
 from namod_ctl.optics.instrument import Instrument
-from namod_ctl.reconstruction.alignment import Alignment, FacetAlignment
+from namod_ctl.reconstruction.alignment import Alignment
 from namod_ctl.reconstruction.reconstruct import Reconstruction
 from namod_ctl.store.campaign import CampaignStore
 from namod_ctl.store.campaign_rows import JournaledOrder
@@ -48,8 +48,8 @@ class MotorCorrector:
 
     @property
     def has_learned(self) -> bool:
-        """Did the last corrections show drives that are not what the config says?"""
-        return self._learned.has_changed
+        """Did the last correction show drives that are not what the config says?"""
+        return self._learned.has_news
 
     def check(self) -> list[str]:
         """Drives that are not well, a line each."""
@@ -105,8 +105,17 @@ class MotorCorrector:
     def plan(self, result: Reconstruction) -> Plan:
         """The correction, from where the drives stand now."""
         states = self._mover.read_states()
-        disabled = self._learned.disabled | self._failed_facets()
-        return plan_correction(result, self._travel_of, states, self._drives, self._settings, disabled)
+        failed = self._failed_facets()
+        trials = {facet_id: travels for facet_id, travels in self._learned.trials().items() if facet_id not in failed}
+        return plan_correction(
+            result,
+            self._learned.travels,
+            states,
+            self._drives,
+            self._settings,
+            {**self._learned.disabled, **failed},
+            trials,
+        )
 
     def changed_since(self, plan: Plan) -> str:
         """Drives that stand elsewhere than when the plan was made."""
@@ -175,9 +184,6 @@ class MotorCorrector:
         low_m = min(order.start_m, order.target_m - self._settings.approach_m) - tolerance_m
         high_m = max(order.start_m, order.target_m) + tolerance_m
         return low_m <= position_m <= high_m
-
-    def _travel_of(self, facet: FacetAlignment) -> Mapping[Leg, float]:
-        return self._learned.travels(facet)
 
     def _failed_facets(self) -> dict[int, str]:
         """Facets a leg of which did not arrive when it was last ordered to."""

@@ -18,10 +18,8 @@ SLOWNESS = 3.0
 """A motion may take so many times as long as its way at the set speed (ramps, a drive that is set slower), and"""
 GRACE_S = 3.0
 """so much longer, before the leg counts as one that does not get there."""
-LOOKS_PER_WAY = 4.0
-"""A moving drive is asked so often on its expected way, but not more often than `poll_s`,"""
-MAX_LOOK_S = 1.0
-"""and not more rarely than this."""
+MAX_LOOK_S = 0.5
+"""A moving drive is asked when it should be there, and then every `poll_s`; but not more rarely than this."""
 N_FAILURES = 3
 """A drive that refuses so often while it is being stopped is left alone."""
 
@@ -86,6 +84,7 @@ class Course(ABC):
         self.detail = ""
         self.outcome: MoveOutcome | None = None
         self._is_ordered = False
+        self._expected_s = -math.inf
         self._at_rest_since_s = math.inf
         self._verdict: tuple[MoveOutcome, str] | None = None
         self._n_failures = 0
@@ -141,7 +140,7 @@ class Course(ABC):
         """
         now_s = clock.monotonic_s()  # before the answer: a drive that moved then may have been late, not later
         state = self.look()
-        self.due_s = now_s + self._settings.poll_s
+        self.due_s = self._next_look_s(now_s)
         if self._verdict is not None:
             self._wind_up(state, now_s)
         elif not self.may_move:
@@ -195,7 +194,11 @@ class Course(ABC):
         self._at_rest_since_s = math.inf
         now_s = clock.monotonic_s()
         self.limit_s = now_s + SLOWNESS * expected_s + GRACE_S
-        self.due_s = now_s + min(max(expected_s / LOOKS_PER_WAY, self._settings.poll_s), MAX_LOOK_S)
+        self._expected_s = now_s + expected_s
+        self.due_s = self._next_look_s(now_s)
+
+    def _next_look_s(self, now_s: float) -> float:
+        return now_s + max(min(self._expected_s - now_s, MAX_LOOK_S), self._settings.poll_s)
 
 
 class MoveCourse(Course):
@@ -222,7 +225,11 @@ class MoveCourse(Course):
         self._go(clock, may_start)
 
     def _follow(self, state: DriveState, clock: MonotonicClock, may_start: Callable[[], bool]) -> None:
-        if self._is_lost_or_faulty(state) or not self._rests(state, clock):
+        if self._is_lost_or_faulty(state):
+            return
+        is_there = abs(state.position_m - self._ways[0]) <= self._settings.arrival_tolerance_m
+        is_below = len(self._ways) > 1 and not state.is_moving and is_there
+        if not is_below and not self._rests(state, clock):
             return
         if len(self._ways) > 1:
             self._ways = self._ways[1:]

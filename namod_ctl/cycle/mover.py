@@ -26,7 +26,9 @@ LOOK_S = 0.05
 STOP_S = 3.0
 """For so long, and"""
 N_STOP_ROUNDS = 3
-"""for so many rounds at least, drives that do not take their stop are told again."""
+"""for so many rounds at least, drives that do not take their stop are told again,"""
+MAX_PAUSE_S = 0.4
+"""after pauses that grow up to this: a line that comes back is stopped soon."""
 
 Answer = TypeVar("Answer")
 
@@ -259,7 +261,7 @@ class Mover:
                     return interrupt
                 n_rounds += 1
                 if n_rounds > 1:
-                    self._clock.wait_s(LOOK_S)
+                    self._clock.wait_s(min(LOOK_S * 2.0 ** (n_rounds - 2), MAX_PAUSE_S))
                 rounds = [worker.submit(worker.stop) for worker in left]
                 wait(rounds)
                 for each in rounds:

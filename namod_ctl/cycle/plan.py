@@ -55,6 +55,7 @@ def plan_correction(
     drives: Mapping[Leg, Drive],
     settings: MotionSettings,
     disabled: Mapping[int, str],
+    trials: Mapping[int, Mapping[Leg, float]],
 ) -> Plan:
     """The correction of an alignment by motors. A facet is turned by all of its legs or not at all.
 
@@ -63,7 +64,9 @@ def plan_correction(
     states
         Of all drives now; a text says why a drive does not answer.
     disabled
-        Facets that were taken out before, and why.
+        Facets that must not be corrected, and why.
+    trials
+        Small travels of disabled facets that will tell what is wrong with them; made only beside a correction.
     """
     orders: list[MoveOrder] = []
     refused: dict[int, str] = {}
@@ -76,11 +79,13 @@ def plan_correction(
             refused[facet.facet_id] = reason
             continue
         turned.append(facet.facet_id)
-        for leg, travel_m in sorted(travels.items()):
-            state = states[leg]
-            assert isinstance(state, DriveState)  # the others were refused
-            if abs(travel_m) >= drives[leg].resolution_m / 2.0:
-                orders.append(MoveOrder(leg, state.position_m, state.position_m + travel_m))
+        orders += _orders(travels, states, drives)
+    taken = {order.leg for order in orders}
+    for facet_id, travels in trials.items():
+        can_move = not _reason_of_drives(travels, states, drives, settings) and not taken.intersection(travels)
+        if turned and facet_id in disabled and can_move:
+            refused[facet_id] += "; a small move tries what is wrong with it"
+            orders += _orders(travels, states, drives)
     return Plan(tuple(orders), tuple(turned), refused, forecast(result, turned))
 
 
@@ -105,6 +110,19 @@ def forecast(
         left_cov = left_cov + [turning_cov_rad2(facet.facet_id) for facet, _ in seen]
     cov = np.array([covariance_of_light(fit.parameters) for _, fit in seen])
     return area_predicted(light.flux, cov, np.where(is_turned[:, None], 0.0, left_rad), left_cov)
+
+
+def _orders(
+    travels: Mapping[Leg, float], states: Mapping[Leg, DriveState | str], drives: Mapping[Leg, Drive]
+) -> list[MoveOrder]:
+    """Orders of legs whose drives are known to be well; a travel of less than half a step is none."""
+    orders = []
+    for leg, travel_m in sorted(travels.items()):
+        state = states[leg]
+        assert isinstance(state, DriveState)  # the others were refused
+        if abs(travel_m) >= drives[leg].resolution_m / 2.0:
+            orders.append(MoveOrder(leg, state.position_m, state.position_m + travel_m))
+    return orders
 
 
 def _reason_of_flags(facet: FacetAlignment) -> str:

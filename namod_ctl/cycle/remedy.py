@@ -20,9 +20,10 @@ from namod_ctl.optics.mounts import Mount
 
 Array = NDArray[np.float64]
 
-# A trial move changes Theta by no more than this per leg if the leg does as told: many times the noise of an
-# estimate, and less than the misalignments that are corrected.
+# A trial move changes Theta by this per leg if the leg does as told, less than the misalignments that are corrected;
+# by more only where that is not as many times the noise of a change.
 _TRIAL_RAD = arcmin_to_rad(3.0)
+_TRIAL_PER_NOISE = 10.0
 _MOVES_BY_DRIVES = (FaultKind.LEG_REVERSED, FaultKind.LEGS_SWAPPED, FaultKind.WRONG_SCALE, FaultKind.FOREIGN_DRIVE)
 
 
@@ -94,8 +95,7 @@ def remedy_of(
 ) -> Remedy:
     """The remedy of `findings`, which `diagnose` made of the same observations.
 
-    Drives crossed between facets are corrected only when all facets of the ring are known; a facet of which a drive
-    is claimed by another facet but whose own story is not known is disabled.
+    Drives crossed between facets are used only when the story of the other facet is known too: a drive has one master.
     """
     seen = observed(mounts, observations, resolution_m)
     maps: dict[int, LegMap] = {}
@@ -113,6 +113,9 @@ def remedy_of(
             maps[facet_id] = LegMap(
                 story.sources, np.array(story.final_gains), None if response is None else response / 2.0
             )
+    for facet_id in [one for one in maps if not {drive.facet_id for drive in maps[one].drives}.isdisjoint(disabled)]:
+        del maps[facet_id]
+        disabled[facet_id] = f"facet {facet_id} is moved by drives of a facet of which nobody knows what moves it"
     return Remedy(mounts, maps, disabled, trials)
 
 
@@ -149,7 +152,10 @@ def _trial(history: FacetHistory, rivals: Sequence[Story], observations: Sequenc
     before all corrections, so that trials do not add up.
     """
     n = history.travel_m.shape[1]
-    size = _TRIAL_RAD / float(np.max(np.linalg.norm(history.response_rad_per_m, axis=0)))
+    noise_rad = float(np.sqrt(np.mean(np.diag(history.noise_rad2))))
+    size = max(_TRIAL_RAD, _TRIAL_PER_NOISE * noise_rad) / float(
+        np.max(np.linalg.norm(history.response_rad_per_m, axis=0))
+    )
     single = np.eye(n)
     both = [single[i] - single[j] for i in range(n) for j in range(i)]
     candidates = size * np.vstack([single, both])

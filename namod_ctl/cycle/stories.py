@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from itertools import combinations
 
@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 LN_EVIDENCE = math.log(100.0)
 # Prior of "as ordered", and of something that is none of the stories, relative to one kind of fault.
 LN_PRIOR_AS_ORDERED = math.log(20.0)
-LN_PRIOR_UNKNOWN = math.log(0.1)
+LN_PRIOR_UNKNOWN = math.log(0.5)
 # Points at which an open gain is integrated, and how many standard deviations around the best to go.
 _N_GAINS = 61
 _GAIN_REACH = 6.0
@@ -138,11 +138,11 @@ PairStories = Callable[[FacetHistory, FacetHistory], Sequence[tuple[Story, Story
 
 @dataclass(frozen=True, slots=True)
 class _Group:
-    """A story of several facets, and by how much (ln) it beats their best single stories."""
+    """A story of several facets, by how much (ln) it beats their best single stories, and each part its rivals."""
 
     stories: Mapping[int, Story]
     gain: float
-    margin: float = math.inf
+    margins: Mapping[int, float] = field(default_factory=dict)
 
 
 def judge(
@@ -154,7 +154,8 @@ def judge(
     """A verdict for every facet.
 
     A facet of which "as ordered" (the first of its single stories) is not refuted at four standard deviations gets
-    that, unless it clearly has a part in what happened to another. For the others all stories compete, alone and in groups; told is what beats every rival by `LN_EVIDENCE`.
+    that, unless it clearly has a part in what happened to another. For the others all stories compete, alone and in
+    groups; told is what beats every rival by `LN_EVIDENCE`.
 
     Parameters
     ----------
@@ -177,9 +178,10 @@ def judge(
         facet_id: history.ln_likelihood_of_anything() + LN_PRIOR_UNKNOWN for facet_id, history in suspects.items()
     }
     best |= {facet_id: max(told[facet_id][0].ln_probability, unknown[facet_id]) for facet_id in suspects}
-    groups = _pairs(seen, suspects.keys(), observations, pair_stories, best) + _rings(
-        suspects, observations, pair_stories, best
-    )
+    groups = _pairs(seen, suspects.keys(), observations, pair_stories, best)
+    # With most facets astray the others may well be in the ring too, near their orders by chance.
+    in_rings = seen if 2 * len(suspects) > len(seen) else suspects
+    groups += _rings(in_rings, len(seen), observations, pair_stories, best)
     in_groups = _told_in_groups(groups, {facet_id: one[0].story for facet_id, one in told.items()})
     verdicts |= {
         facet_id: verdict
@@ -248,25 +250,36 @@ def _pairs(
     pair_stories: PairStories,
     best: Mapping[int, float],
 ) -> list[_Group]:
-    """Stories of a suspect and another facet that beat what can be told of each alone."""
+    """Stories of a suspect and another facet that beat what can be told of each alone, or rival it."""
     pairs = [(a, b) for a, b in combinations(seen, 2) if a in suspects or b in suspects]
     groups = []
     for a, b in pairs:
         stories = pair_stories(seen[a], seen[b])
         if not stories:
             continue
-        gain = -math.log(len(pairs)) - best[a] - best[b] + np.zeros(len(stories))
+        gain = _ln_prior_of_ring(2, len(seen)) - best[a] - best[b] + np.zeros(len(stories))
         for side, facet_id in enumerate((a, b)):
             travels = np.array([pair[side].travel_m(seen[facet_id], observations) for pair in stories])
             gain += seen[facet_id].deviation(travels)[1] + np.array([pair[side].ln_prior for pair in stories])
         groups += [
-            _Group({a: pair[0], b: pair[1]}, float(one)) for pair, one in zip(stories, gain, strict=True) if one > 0.0
+            _Group({a: pair[0], b: pair[1]}, float(one))
+            for pair, one in zip(stories, gain, strict=True)
+            if one > -LN_EVIDENCE
         ]
     return groups
 
 
+def _ln_prior_of_ring(size: int, n_facets: int) -> float:
+    """Ln prior of one fault that mixes up `size` facets, relative to as many independent faults.
+
+    One fault instead of several, but any of the other facets could have been the next in the ring.
+    """
+    return (size - 1) * (LN_PRIOR_AS_ORDERED - math.log(n_facets - 1))
+
+
 def _rings(
     suspects: Mapping[int, FacetHistory],
+    n_facets: int,
     observations: Sequence[Observation],
     pair_stories: PairStories,
     best: Mapping[int, float],
@@ -286,8 +299,8 @@ def _rings(
                 followed.append(j)
         travels = [crossed[i, j].travel_m(suspects[a], observations) for j in followed]
         if travels:
-            # The prior of a ring: every facet in it could as well follow any other suspect.
-            score[i, followed] = suspects[a].deviation(np.array(travels))[1] - math.log(len(ids))
+            prior = _ln_prior_of_ring(2, n_facets) / 2.0
+            score[i, followed] = suspects[a].deviation(np.array(travels))[1] + prior
         score[i, i] = best[a]
     score = np.maximum(score, -1e9)
     rows, columns = linear_sum_assignment(score, maximize=True)
@@ -297,13 +310,13 @@ def _rings(
         if len(ring) < 3:
             continue
         gain = float(sum(score[i, columns[i]] - score[i, i] for i in ring))
-        margin = math.inf
+        margins = {}
         for i in ring:
             without = score.copy()
             without[i, columns[i]] = -1e9
             r, c = linear_sum_assignment(without, maximize=True)
-            margin = min(margin, total - float(without[r, c].sum()))
-        groups.append(_Group({ids[i]: crossed[i, int(columns[i])] for i in ring}, gain, margin))
+            margins[ids[i]] = total - float(without[r, c].sum())
+        groups.append(_Group({ids[i]: crossed[i, int(columns[i])] for i in ring}, gain, margins))
     return groups
 
 
@@ -328,23 +341,34 @@ def _told_in_groups(groups: Sequence[_Group], best_single: Mapping[int, Story]) 
     """
     verdicts: dict[int, Verdict] = {}
     for group in sorted(groups, key=lambda one: -one.gain):
-        if group.gain <= 0.0 or not verdicts.keys().isdisjoint(group.stories):
+        if not verdicts.keys().isdisjoint(group.stories):
             continue
         rivals = [
             other
             for other in groups
-            if other is not group
+            if _names(other.stories) != _names(group.stories)
             and other.gain > group.gain - LN_EVIDENCE
             and not group.stories.keys().isdisjoint(other.stories)
             and verdicts.keys().isdisjoint(other.stories)
         ]
-        margin = min([group.gain, group.margin] + [group.gain - other.gain for other in rivals])
+        all_margin = min([group.gain] + [group.gain - other.gain for other in rivals])
         for facet_id, story in group.stories.items():
-            if margin >= LN_EVIDENCE:
-                verdicts[facet_id] = Verdict(facet_id, story, margin)
+            margin = min(all_margin, group.margins.get(facet_id, math.inf))
+            possible = [story, *(other.stories[facet_id] for other in rivals if facet_id in other.stories)]
+            if group.gain < LN_EVIDENCE and facet_id in best_single:
+                possible.append(best_single[facet_id])
+            is_one = len({_name(one) for one in possible}) == 1 and len(possible) > 1
+            if margin >= LN_EVIDENCE or is_one:
+                verdicts[facet_id] = Verdict(facet_id, story, max(margin, LN_EVIDENCE))
             else:
-                others = tuple(other.stories[facet_id] for other in rivals if facet_id in other.stories)
-                is_rivalled_alone = group.gain < LN_EVIDENCE and facet_id in best_single
-                alone = (best_single[facet_id],) if is_rivalled_alone else ()
-                verdicts[facet_id] = Verdict(facet_id, None, 0.0, (story, *others, *alone))
+                verdicts[facet_id] = Verdict(facet_id, None, 0.0, tuple(possible))
     return verdicts
+
+
+def _name(story: Story) -> tuple[object, ...]:
+    """What a story is told as: stories of one name need not be told apart."""
+    return story.kind, story.legs, frozenset(source.facet_id for source in story.sources) | {story.on_top}
+
+
+def _names(stories: Mapping[int, Story]) -> dict[int, tuple[object, ...]]:
+    return {facet_id: _name(story) for facet_id, story in stories.items()}

@@ -23,6 +23,7 @@ from namod_ctl.twin.randomness import generator
 from namod_ctl.twin.settings import FaultSpec
 
 MOTION_FAULTS = frozenset({"stuck_leg", "lost_steps", "backlash_grown", "limit_switch", "supply_sag", "drive_reset"})
+FAULTS_IN_TIME = MOTION_FAULTS | WIRING_FAULTS
 ENDLESS_MOVE_S = 1.0
 """What counts as the length of a motion whose end is not known, a search for the reference, for a reset in it."""
 NOTE_S = 1.0
@@ -119,11 +120,14 @@ class TwinDrives:
     def update(self, time_s: float) -> None:
         """Let all motors go on until `time_s`; nothing if that is over."""
         with self._lock:
+            if not self._moving and not self.faults.has_any(FAULTS_IN_TIME):
+                self._now_s = max(self._now_s, time_s)
+                return
             while True:
                 self._obey_faults()
                 if self._now_s >= time_s:
                     return
-                end_s = self.faults.next_change_s(MOTION_FAULTS | WIRING_FAULTS, self._now_s, time_s)
+                end_s = self.faults.next_change_s(FAULTS_IN_TIME, self._now_s, time_s)
                 end_s = min([end_s, *self._reset_moments_s(end_s)])
                 if self.faults.active("supply_sag", self._now_s):  # then it matters when one of them gets there
                     end_s = min([end_s, *(self._motors[leg].end_s for leg in self._moving)])
@@ -292,12 +296,12 @@ class TwinDrives:
     def _call(self, leg: Leg) -> None:
         """Bring a motor, which may have rested for long, to the present moment and its conditions."""
         self._motors[leg].update(self._now_s)
-        if any(self.faults.of(name) for name in MOTION_FAULTS):
+        if self.faults.has_any(MOTION_FAULTS):
             self._motors[leg].conditions = self._conditions(leg)
 
     def _obey_faults(self) -> None:
         """Put moving motors under the conditions of the present moment, and reset what is to be reset now."""
-        if any(self.faults.of(name) for name in WIRING_FAULTS):
+        if self.faults.has_any(WIRING_FAULTS):
             self._regear()
         if self.faults.of("drive_reset"):
             for leg, motor in self._motors.items():

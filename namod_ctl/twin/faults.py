@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Container, Mapping
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 
 from namod_ctl.core.drives import Leg
@@ -170,6 +171,7 @@ class FaultPlan:
 
     def __init__(self) -> None:
         self._faults: tuple[Fault, ...] = ()
+        self._names: frozenset[str] = frozenset()
 
     def inject(self, spec: FaultSpec) -> Fault:
         """Add a fault.
@@ -196,7 +198,12 @@ class FaultPlan:
         params = {**kind.defaults, **spec.params}
         fault = Fault(spec.name, len(self._faults), spec.start_s, spec.start_s + duration_s, params)
         self._faults = (*self._faults, fault)
+        self._names |= {fault.name}
         return fault
+
+    def has_any(self, names: AbstractSet[str]) -> bool:
+        """Has any fault of these names been injected, whenever it happens?"""
+        return not self._names.isdisjoint(names)
 
     def of(self, name: str) -> list[Fault]:
         """All faults of that name, whenever they happen."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from types import FrameType
@@ -15,39 +15,22 @@ import typer
 from rich.console import Console
 
 from namod_ctl.app.align_view import AlignView, cycle_table
-from namod_ctl.app.alignment_files import alignment_files, alignment_from_json, alignment_to_json
-from namod_ctl.app.build_actuators import build_motion_settings
-from namod_ctl.app.build_recording import build_record_settings
-from namod_ctl.app.build_twin import build_twin, load_twin_settings
-from namod_ctl.app.build_twin_actuators import build_twin_actuators, twin_wiring
+from namod_ctl.app.build_twin import load_twin_settings
+from namod_ctl.app.build_twin_campaign import open_twin_campaign
 from namod_ctl.app.campaign_report import write_campaign_report
-from namod_ctl.app.commands.instruct import write_instructions
-from namod_ctl.app.instruction_sheets import PDF_FILE
 from namod_ctl.app.config import InstrumentConfig, load_config
-from namod_ctl.app.reconstruction_report import REPORT_FILE, report_text
 from namod_ctl.app.twin_note import note_twin, noted_twin
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.motion import StopSwitch
-from namod_ctl.cycle.campaign import Campaign, CampaignSettings, Outside
-from namod_ctl.cycle.correct import Corrector
-from namod_ctl.cycle.correct_by_hand import ManualCorrector
-from namod_ctl.cycle.correct_by_motor import MotorCorrector
-from namod_ctl.cycle.mover import Mover
-from namod_ctl.cycle.record import Equipment
-from namod_ctl.reconstruction.alignment import Alignment
-from namod_ctl.reconstruction.reconstruct import Reconstruction
+from namod_ctl.cycle.campaign_parts import CampaignSettings
+from namod_ctl.cycle.record import RecordSettings
 from namod_ctl.store.campaign import CampaignStore
-from namod_ctl.store.results import write_results
-from namod_ctl.twin.operator import GONIOMETER_ERROR_RAD, TwinOperator
 from namod_ctl.twin.settings import TwinSettings
-from namod_ctl.twin.twin import Twin
-from namod_ctl.twin.world import open_world
 
 DEFAULT_CONFIG = "fact_actuated"
 DEFAULT_OUT = Path("CAMPAIGN")
 DEFAULT_SEED = 1
-WORLD_FILE = "twin_world.jsonl"
 EXIT_HELD = 3  # the campaign ended, and a person must look
 
 
@@ -97,31 +80,24 @@ def align(
     Example: namod-ctl align --out CAMPAIGN
     """
     console = Console(highlight=False)
-    switch = StopSwitch()
     with ExitStack() as stack:
-        start = (
-            _resumed(stack, resume, config, seed, twin_settings, out)
-            if resume is not None
-            else _begun(stack, out or DEFAULT_OUT, config or DEFAULT_CONFIG, seed, twin_settings, force=force)
-        )
-        store, instrument_config = start.store, start.config
-        twin = build_twin(instrument_config, start.settings, start.seed, twin_wiring(instrument_config))
-        stack.callback(open_world(store.path / WORLD_FILE, twin).close)
-        corrector = _corrector(stack, store, instrument_config, twin, start.seed, switch)
-        settings = CampaignSettings(
-            record=replace(build_record_settings(instrument_config), pace_s=twin.telescope.pass_s / records),
-            n_records=records,
-            max_cycles=cycles,
-            is_asked=approve is Approve.ASK,
-        )
-        equipment = Equipment(twin.star_camera, twin.reflector_camera, twin.clock, twin.wall_clock)
-        outside = Outside(lambda: equipment, alignment_to_json, alignment_from_json, _write_cycle)
+        if resume is not None:
+            start = _resumed(stack, resume, config, seed, twin_settings, out)
+        else:
+            start = _begun(stack, out or DEFAULT_OUT, config or DEFAULT_CONFIG, seed, twin_settings, force=force)
+        store = start.store
         if store.last_state() == "held":
             raise ConfigError(f"{store.path}: is held; look why (namod-ctl status), then namod-ctl release")
-        with AlignView(console) as view, _stopped_by_sigterm():
-            campaign = Campaign(store, twin.instrument, corrector, outside, settings, SystemClock(), switch, view)
+        wishes = CampaignSettings(RecordSettings(), records, cycles, approve is Approve.ASK)
+        switch = StopSwitch()
+        view = stack.enter_context(AlignView(console))
+        opened = stack.enter_context(
+            open_twin_campaign(store, start.config, start.settings, start.seed, wishes, SystemClock(), switch, view)
+        )
+        twin = opened.twin
+        with _stopped_by_sigterm():
             try:
-                state = campaign.run()
+                state = opened.campaign.run()
             finally:
                 write_campaign_report(store, twin.instrument)
         console.print(cycle_table(store.cycles()))
@@ -154,27 +130,6 @@ def _resumed(
     if noted is None:
         raise ConfigError(f"{path}: was not begun on the twin, and there are no drivers for cameras yet")
     return _Start(store, InstrumentConfig.from_json(store.config_json, f"{path}: config"), *noted)
-
-
-def _corrector(
-    stack: ExitStack, store: CampaignStore, config: InstrumentConfig, twin: Twin, seed: int, switch: StopSwitch
-) -> Corrector:
-    if config.actuators is None:
-        operator = TwinOperator(twin, seed)
-
-        def write_sheets(run: Path, alignment: Alignment) -> str:
-            write_instructions(run, alignment, twin.instrument, None, f"{store.path.name}/{run.name}")
-            return f"sheets for the ladder: {run / PDF_FILE}; then namod-ctl done {store.path} --facet ... or --all"
-
-        return ManualCorrector(store, twin.instrument, write_sheets, GONIOMETER_ERROR_RAD, operator.turn)
-    buses = stack.enter_context(build_twin_actuators(config, twin.drives))
-    motion = build_motion_settings(config)
-    drives = {leg: drive for bus in buses for leg, drive in bus.drives.items()}
-    return MotorCorrector(store, twin.instrument, Mover(buses, twin.clock, motion, switch), drives, motion)
-
-
-def _write_cycle(run: Path, result: Reconstruction) -> None:
-    write_results(run, {REPORT_FILE: report_text(result, {}).encode()} | alignment_files(result.alignment))
 
 
 @contextmanager

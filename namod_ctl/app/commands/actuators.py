@@ -1,0 +1,301 @@
+"""`namod-ctl actuators`: look at the drives, move them by hand, stop them, test them."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from types import FrameType
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.text import Text
+
+from namod_ctl.app.actuator_tables import (
+    legs_named,
+    short_name,
+    table_of_drives,
+    table_of_orders,
+    table_of_results,
+    table_of_tests,
+    table_of_words,
+)
+from namod_ctl.app.build_actuators import build_bus_settings, build_motion_settings, open_actuators
+from namod_ctl.app.build_twin_actuators import build_twin_actuators, twin_wiring
+from namod_ctl.app.config import InstrumentConfig, load_config
+from namod_ctl.core.clock import SystemMonotonicClock
+from namod_ctl.core.drives import DriveState, Leg
+from namod_ctl.core.errors import CommunicationError, ConfigError
+from namod_ctl.core.interfaces import MonotonicClock
+from namod_ctl.core.motion import MoveOrder, MoveOutcome, MoveResult, StopSwitch
+from namod_ctl.core.motion_settings import MotionSettings
+from namod_ctl.core.units import m_to_mm, mm_to_m
+from namod_ctl.cycle.mover import Mover
+from namod_ctl.cycle.selftest import self_test
+from namod_ctl.devices.buses import open_bus
+from namod_ctl.twin.clock import ManualClock
+from namod_ctl.twin.drives import TwinDrives
+from namod_ctl.twin.faults import FaultPlan
+
+DEFAULT_CONFIG = "fact_actuated"
+TWIN_SEED = 1
+_STOP_REASON = "namod-ctl actuators stop"
+EXIT_INCOMPLETE = 1
+"""Not every leg did what it was asked to do."""
+TEST_TRAVEL_MM = 0.1
+MAX_TEST_TRAVEL_MM = 2.0
+
+app = typer.Typer(add_completion=False, no_args_is_help=True, help="Look at the drives of the legs, move, stop, test.")
+
+_Config = Annotated[str, typer.Option("--config", help="Instrument: a TOML file, or a built-in name.")]
+_IsTwin = Annotated[
+    bool, typer.Option("--twin", help="A digital twin of the drives instead, new at every call, in its own time.")
+]
+_Legs = Annotated[
+    list[str] | None, typer.Argument(metavar="[LEG]...", help="13.2 is leg 2 of facet 13, 13 all its legs.")
+]
+_IsAll = Annotated[bool, typer.Option("--all", help="All legs that have a drive.")]
+_IsYes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask before anything moves.")]
+
+
+@dataclass(frozen=True, slots=True)
+class _Rig:
+    mover: Mover
+    settings: MotionSettings
+    console: Console
+
+    def chosen(self, names: list[str] | None, *, is_all: bool) -> tuple[Leg, ...]:
+        if bool(names) == is_all:
+            raise ConfigError("name the legs, such as 13.2, or say --all for all of them")
+        return self.mover.legs if is_all else legs_named(names or [], self.mover.legs)
+
+
+@app.command("list")
+def list_drives(config: _Config = DEFAULT_CONFIG, twin: _IsTwin = False) -> None:
+    """Ask every drive of the config how it is; nothing moves.
+
+    Example: namod-ctl actuators list --twin
+    """
+    with _rig(config, is_twin=twin) as rig:
+        states = rig.mover.read_states()
+        answering = [leg for leg, state in states.items() if not isinstance(state, str)]
+        identities = rig.mover.identities(answering)
+        names = {leg: rig.mover.drive_name(leg) for leg in states}
+        rig.console.print(table_of_drives(states, identities, names))
+        n_ready = sum(
+            isinstance(state, DriveState) and state.is_homed and not state.faults for state in states.values()
+        )
+        rig.console.print(f"{n_ready} of {len(states)} drives are ready to move")
+    _leave(is_complete=n_ready == len(states))
+
+
+@app.command()
+def home(
+    legs: _Legs = None,
+    all_: _IsAll = False,
+    config: _Config = DEFAULT_CONFIG,
+    twin: _IsTwin = False,
+    yes: _IsYes = False,
+) -> None:
+    """Bring drives to their reference switches: after that they know where they are.
+
+    Example: namod-ctl actuators home 13 --twin
+    """
+    with _rig(config, is_twin=twin) as rig:
+        chosen = rig.chosen(legs, is_all=all_)
+        states = rig.mover.read_states(chosen)
+        rig.console.print(table_of_words("stands at", {leg: _standing(state) for leg, state in states.items()}))
+        _ask(f"{len(chosen)} legs go to their references, wherever those are. Go on?", is_yes=yes)
+        homed = rig.mover.home(chosen, lambda: None)
+        rig.console.print(table_of_words("result", {leg: words or "homed" for leg, words in homed.items()}))
+    _leave(is_complete=not any(homed.values()))
+
+
+@app.command()
+def move(
+    legs: _Legs = None,
+    to_mm: Annotated[float, typer.Option(help="Position along the leg, +z, from the drive's reference.")] = ...,  # type: ignore[assignment]
+    all_: _IsAll = False,
+    config: _Config = DEFAULT_CONFIG,
+    twin: _IsTwin = False,
+    yes: _IsYes = False,
+) -> None:
+    """Bring legs to a position. A facet moves whole or not at all.
+
+    Example: namod-ctl actuators move 13 --to-mm 0.5 --twin
+    """
+    _carry_out(legs, lambda now_m: mm_to_m(to_mm), config, is_all=all_, is_twin=twin, is_yes=yes)
+
+
+@app.command()
+def jog(
+    legs: _Legs = None,
+    by_mm: Annotated[float, typer.Option(help="Travel along the leg, +z.")] = ...,  # type: ignore[assignment]
+    all_: _IsAll = False,
+    config: _Config = DEFAULT_CONFIG,
+    twin: _IsTwin = False,
+    yes: _IsYes = False,
+) -> None:
+    """Move legs by some way from where they stand. A facet moves whole or not at all.
+
+    Example: namod-ctl actuators jog 13.2 --by-mm -0.05 --twin
+    """
+    _carry_out(legs, lambda now_m: now_m + mm_to_m(by_mm), config, is_all=all_, is_twin=twin, is_yes=yes)
+
+
+@app.command()
+def stop(config: _Config = DEFAULT_CONFIG, twin: _IsTwin = False) -> None:
+    """Halt every drive of the config, on all lines that can be opened. While a campaign holds them: namod-ctl stop.
+
+    Example: namod-ctl actuators stop
+    """
+    problems: list[str] = []
+    if twin:
+        with _rig(config, is_twin=True) as rig:
+            words = rig.mover.stop_all(_STOP_REASON)
+    else:
+        words, problems = _stop_hardware(load_config(config))
+    console = Console(highlight=False)
+    console.print(table_of_words("result", words))
+    if problems:
+        raise ConfigError("\n".join(["these lines can not be opened, their drives were not stopped:", *problems]))
+    _leave(is_complete=all(line.startswith("stands") for line in words.values()))
+
+
+@app.command()
+def selftest(
+    legs: _Legs = None,
+    all_: _IsAll = False,
+    travel_mm: Annotated[
+        float, typer.Option(min=0.01, max=MAX_TEST_TRAVEL_MM, help="So far each leg goes, and back.")
+    ] = TEST_TRAVEL_MM,
+    config: _Config = DEFAULT_CONFIG,
+    twin: _IsTwin = False,
+    yes: _IsYes = False,
+) -> None:
+    """Move each leg a little and back: does it get there, and do all others on its line stand still?
+
+    The play of spindles can not be measured with drives that tell one position only.
+
+    Example: namod-ctl actuators selftest 13 --twin
+    """
+    with _rig(config, is_twin=twin) as rig:
+        chosen = rig.chosen(legs, is_all=all_)
+        _ask(f"{len(chosen)} legs go {travel_mm:g} mm up and back, one after the other. Go on?", is_yes=yes)
+        tests = []
+        with rig.console.status("") as status:
+            for test in self_test(rig.mover, chosen, mm_to_m(travel_mm), rig.settings, lambda: None):
+                tests.append(test)
+                status.update(f"{len(tests)} of {len(chosen)} legs tested")
+        rig.console.print(table_of_tests(tests))
+        n_passed = sum(test.has_passed for test in tests)
+        rig.console.print(f"{n_passed} of {len(chosen)} legs passed; play was not measured: drives tell one position")
+    _leave(is_complete=n_passed == len(chosen))
+
+
+def _carry_out(
+    names: list[str] | None,
+    target_of: Callable[[float], float],
+    config: str,
+    *,
+    is_all: bool,
+    is_twin: bool,
+    is_yes: bool,
+) -> None:
+    with _rig(config, is_twin=is_twin) as rig:
+        states = rig.mover.read_states(rig.chosen(names, is_all=is_all))
+        silent = {leg: state for leg, state in states.items() if isinstance(state, str)}
+        if silent:
+            rig.console.print(table_of_words("does not answer", silent))
+            raise ConfigError(f"{len(silent)} of {len(states)} drives do not answer: nothing was moved")
+        orders = [
+            MoveOrder(leg, state.position_m, target_of(state.position_m))
+            for leg, state in states.items()
+            if isinstance(state, DriveState)
+        ]
+        rig.console.print(table_of_orders(orders))
+        _ask(f"{len(orders)} legs move. Go on?", is_yes=is_yes)
+        results = _execute(rig, orders)
+        rig.console.print(table_of_results(results))
+    _leave(is_complete=all(result.outcome is MoveOutcome.ARRIVED for result in results))
+
+
+def _stop_hardware(config: InstrumentConfig) -> tuple[dict[Leg, str], list[str]]:
+    """What became of each drive, and lines that cannot be opened. Nothing is said on a line before the stop."""
+    problems = []
+    with ExitStack() as stack:
+        buses = []
+        for settings in build_bus_settings(config):
+            try:
+                bus = open_bus(settings)
+            except (ConfigError, CommunicationError) as problem:
+                problems.append(f"bus {settings.name!r}: {problem}")
+            else:
+                stack.callback(bus.close)
+                buses.append(bus)
+        mover = Mover(buses, SystemMonotonicClock(), build_motion_settings(config), StopSwitch())
+        return mover.stop_all(_STOP_REASON), problems
+
+
+def _execute(rig: _Rig, orders: Sequence[MoveOrder]) -> list[MoveResult]:
+    told: list[MoveResult] = []
+    try:
+        with rig.console.status(f"{len(orders)} legs move; Ctrl-C stops all drives"):
+            return rig.mover.execute(orders, told.append, lambda: None)
+    except (KeyboardInterrupt, SystemExit):
+        rig.console.print(table_of_results(told))
+        raise
+
+
+@contextmanager
+def _rig(config: str, *, is_twin: bool) -> Iterator[_Rig]:
+    """The drives of a config, or of a twin of it, and a mover; SIGTERM stops as Ctrl-C does."""
+    loaded = load_config(config)
+    settings = build_motion_settings(loaded)
+    console = Console(highlight=False)
+    with ExitStack() as stack:
+        clock: MonotonicClock
+        if is_twin:
+            manual = ManualClock()
+            clock = manual
+            drives = TwinDrives(twin_wiring(loaded), manual, FaultPlan(), TWIN_SEED)
+            buses = stack.enter_context(build_twin_actuators(loaded, drives))
+        else:
+            clock = SystemMonotonicClock()
+            buses = stack.enter_context(open_actuators(loaded))
+        for bus in buses:
+            if bus.unreachable:
+                legs = ", ".join(short_name(leg) for leg in bus.unreachable)
+                console.print(Text(f"{bus.name}: no proper answer from legs {legs}", style="yellow"))
+        stack.enter_context(_ended_by_sigterm())
+        yield _Rig(Mover(buses, clock, settings, StopSwitch()), settings, console)
+
+
+@contextmanager
+def _ended_by_sigterm() -> Iterator[None]:
+    def leave(number: int, frame: FrameType | None) -> None:
+        raise SystemExit(128 + number)
+
+    before = signal.signal(signal.SIGTERM, leave)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _standing(state: DriveState | str) -> str:
+    if isinstance(state, str):
+        return state
+    return f"{m_to_mm(state.position_m):.4f} mm" if state.is_homed else "an unknown place: not homed"
+
+
+def _ask(question: str, *, is_yes: bool) -> None:
+    if not is_yes:
+        typer.confirm(question, abort=True)
+
+
+def _leave(*, is_complete: bool) -> None:
+    if not is_complete:
+        raise typer.Exit(EXIT_INCOMPLETE)
