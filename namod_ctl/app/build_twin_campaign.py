@@ -98,7 +98,8 @@ def _by_motors(
     buses = stack.enter_context(build_twin_actuators(config, twin.drives))
     motion = build_motion_settings(config)
     drives = {leg: drive for bus in buses for leg, drive in bus.drives.items()}
-    return MotorCorrector(store, twin.instrument, Mover(buses, twin.clock, motion, switch), drives, motion)
+    mover = Mover(buses, twin.clock, motion, switch)
+    return MotorCorrector(store, twin.instrument, mover, drives, motion, twin.clock)
 
 
 def _write_cycle(run: Path, result: Reconstruction) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 
 from namod_ctl.core.drives import Drive, DriveState, Leg
 from namod_ctl.core.errors import NamodError, SafetyStop
+from namod_ctl.core.interfaces import MonotonicClock
 from namod_ctl.core.motion import MoveOrder, MoveOutcome, MoveResult
 from namod_ctl.core.motion_settings import MotionSettings
 from namod_ctl.core.units import m_to_mm
@@ -41,9 +42,11 @@ class MotorCorrector:
         mover: Mover,
         drives: Mapping[Leg, Drive],
         settings: MotionSettings,
+        clock: MonotonicClock,
     ) -> None:
         self._store, self._instrument = store, instrument
         self._mover, self._drives, self._settings = mover, drives, settings
+        self._clock = clock
         self._learned = LearnedWiring(instrument.mounts, max(drive.resolution_m for drive in drives.values()))
 
     @property
@@ -64,7 +67,7 @@ class MotorCorrector:
         unfinished = self._store.unfinished_orders()
         if not unfinished:
             return
-        states = self._mover.read_states([journaled.order.leg for journaled in unfinished])
+        states = self._standing([journaled.order.leg for journaled in unfinished], poll)
         rest: list[tuple[JournaledOrder, float]] = []
         strangers = []
         for journaled in unfinished:
@@ -177,6 +180,15 @@ class MotorCorrector:
         ]
         text = f"{counts[MoveOutcome.ARRIVED]} of {len(orders)} legs arrived"
         return text if not failed else f"{text}; {'; '.join(failed[:_N_SHOWN])}"
+
+    def _standing(self, legs: Sequence[Leg], poll: Callable[[], None]) -> Mapping[Leg, DriveState | str]:
+        """State of the drives when none moves any more: one that was under way at a crash goes on to its target."""
+        while True:
+            states = self._mover.read_states([leg for leg in legs if leg in self._drives])
+            if not any(isinstance(state, DriveState) and state.is_moving for state in states.values()):
+                return states
+            poll()
+            self._clock.wait_s(self._settings.poll_s)
 
     def _is_on_its_way(self, order: MoveOrder, position_m: float) -> bool:
         """Between where it was and where it was sent, the one-sided approach from below included."""

@@ -10,6 +10,7 @@ from namod_ctl.app.build_actuators import build_motion_settings
 from namod_ctl.app.build_twin_actuators import build_twin_actuators, twin_wiring
 from namod_ctl.app.config import InstrumentConfig, load_config
 from namod_ctl.core.drives import DriveState, Leg
+from namod_ctl.core.interfaces import MonotonicClock
 from namod_ctl.core.motion import MoveOrder, MoveOutcome, MoveResult, StopSwitch
 from namod_ctl.core.motion_settings import MotionSettings
 from namod_ctl.cycle.mover import Mover
@@ -27,7 +28,7 @@ N_MOVING = 6
 
 @dataclass
 class MotionRig:
-    clock: ManualClock
+    clock: MonotonicClock
     drives: TwinDrives
     buses: list[DriveBus]
     settings: MotionSettings
@@ -95,9 +96,12 @@ def small_config(name: str, *, in_memory: bool = True) -> InstrumentConfig:
 
 
 @contextmanager
-def motion_rig(name: str = "fact_actuated", *, in_memory: bool = True) -> Iterator[MotionRig]:
+def motion_rig(
+    name: str = "fact_actuated", *, in_memory: bool = True, clock: MonotonicClock | None = None
+) -> Iterator[MotionRig]:
+    """`clock` None: the twin's own, which passes when somebody waits."""
     config = small_config(name, in_memory=in_memory)
-    clock, switch = ManualClock(), StopSwitch()
+    clock, switch = clock or ManualClock(), StopSwitch()
     drives = TwinDrives(twin_wiring(config), clock, FaultPlan(), SEED)
     with build_twin_actuators(config, drives) as buses:
         settings = build_motion_settings(config)

@@ -13,6 +13,7 @@ from types import FrameType
 import pytest
 from motion_rig import N_MOVING, MotionRig, legs_by_outcome, motion_rig
 
+from namod_ctl.core.clock import SystemMonotonicClock
 from namod_ctl.core.drives import Leg
 from namod_ctl.core.errors import StoreError
 from namod_ctl.core.motion import MoveOrder, MoveOutcome, StopSwitch
@@ -124,6 +125,25 @@ def assert_stood_from(rig: MotionRig, stopped_s: float) -> None:
     rig.clock.wait_s(10.0)
     assert rig.n_moving() == 0
     assert {leg: rig.drives.travel_m(leg) for leg in rig.drives.legs} == true_m
+
+
+@pytest.mark.parametrize("name", ["fact_actuated", "fact_zaber", "fact_modbus_rtu"])
+def test_a_stop_takes_less_than_half_a_second_of_real_time(name: str) -> None:
+    """Everything in the computer's own time, over pseudo terminals; the drives' ramps alone take 0.2 s."""
+    with motion_rig(name, in_memory=False, clock=SystemMonotonicClock()) as rig:
+        orders = rig.orders(mm_to_m(1.9))
+        thrown_s = []
+
+        def while_waiting() -> None:
+            if not thrown_s and rig.n_moving() == 2 * N_MOVING:
+                thrown_s.append(rig.clock.monotonic_s())
+                rig.switch.throw("stop")
+
+        results = rig.execute(orders, while_waiting)
+        assert set(legs_by_outcome(results)) == {MoveOutcome.STOPPED}
+        rests_s = [entry.time_s for entry in rig.drives.log if entry.order == "arrived"]
+        assert max(rests_s) <= thrown_s[0] + STOPPED_WITHIN_S
+        assert rig.n_moving() == 0
 
 
 def test_stop_while_answers_get_lost(rig: MotionRig) -> None:

@@ -178,21 +178,54 @@ def test_a_bus_that_comes_back_is_connected_again(tmp_path: Path) -> None:
 
 
 def test_ports_that_cannot_be_opened_are_told_together_and_none_is_left_open(tmp_path: Path) -> None:
-    config = two_facets(tmp_path)
-    clock = ManualClock()
-    with PtyLine(DriveLine(twin_drives(config, clock), "south")) as line:
-        for text in (
-            TWO_FACETS.format(south="/dev/no_such_port", north="/dev/nor_this_one"),
-            TWO_FACETS.format(south="/dev/no_such_port", north="loopback://nobody"),
-        ):
-            (tmp_path / "it.toml").write_text(text)
-            with pytest.raises(ConfigError) as refused, open_actuators(load_config(tmp_path / "it.toml")):
+    config = two_facets(tmp_path, "/dev/no_such_port", "loopback://nobody")
+    with pytest.raises(ConfigError) as refused, open_actuators(config):
+        pass
+    first, second = str(refused.value).splitlines()
+    assert first.startswith("bus 'south': /dev/no_such_port can not be opened: there is no such port")
+    assert second.startswith("bus 'north': loopback://nobody: nothing in this program answers there")
+    with PtyLine(DriveLine(twin_drives(config, ManualClock()), "south")) as line:
+        port = str(Path(line.port).resolve())
+        config = two_facets(tmp_path, port, "/dev/no_such_port")
+        with pytest.raises(ConfigError) as refused, open_actuators(config):
+            pass
+        with serial.Serial(port, exclusive=True):
+            assert "no_such_port" in str(refused.value)  # which keeps alive what was opened, were it not closed
+
+
+def test_hardware_is_opened_at_its_own_urls_and_let_go_of(tmp_path: Path) -> None:
+    wiring = two_facets(tmp_path)
+    drives = twin_drives(wiring, ManualClock())
+    with PtyLine(DriveLine(drives, "south")) as south, PtyLine(DriveLine(drives, "north")) as north:
+        ports = [str(Path(line.port).resolve()) for line in (south, north)]
+        config = two_facets(tmp_path, *ports)
+        with open_actuators(config) as buses:
+            assert [bus.name for bus in buses] == [f"south ({ports[0]})", f"north ({ports[1]})"]
+            assert [bus.unreachable for bus in buses] == [{}, {}]
+            positions = [drive.state().position_m for bus in buses for drive in bus.drives.values()]
+            assert positions == pytest.approx([drives.motor(leg).count * 3e-6 for leg in drives.legs])
+        for port in ports:
+            with serial.Serial(port, exclusive=True):
                 pass
-            problems = str(refused.value).splitlines()
-            assert len(problems) == 2
-            assert problems[0].startswith("bus 'south': /dev/no_such_port can not be opened: there is no such port")
-            assert problems[1].startswith("bus 'north': ")
-        assert Path(line.port).exists()
+
+
+def test_the_twins_legs_have_the_play_of_the_configs_mount(tmp_path: Path) -> None:
+    text = TWO_FACETS.format(south="loopback://a", north="loopback://b") + "\n[mount]\nbacklash_um = 42.0\n"
+    (tmp_path / "it.toml").write_text(text)
+    config = load_config(tmp_path / "it.toml")
+    clock = ManualClock()
+    drives = twin_drives(config, clock)
+    leg = Leg(0, 2)
+    travels_m = []
+    with build_twin_actuators(config, drives) as buses:
+        drive = buses[0].drives[leg]
+        for target_m in (1e-3, 2e-3, 1e-3):
+            drive.start_move(target_m)
+            clock.wait_s(LONG_S)
+            drive.state()
+            travels_m.append(drives.travel_m(leg))
+    assert travels_m[1] - travels_m[0] == pytest.approx(1e-3, abs=6e-6)
+    assert travels_m[2] - travels_m[1] == pytest.approx(-(1e-3 - 42e-6), abs=6e-6)
 
 
 def test_config_check_opens_ports_when_asked_to(
