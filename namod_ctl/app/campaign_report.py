@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from namod_ctl.app.alignment_files import alignment_from_json
 from namod_ctl.app.figure_style import DPI, ORANGE, SKY, figure_to_png
 from namod_ctl.app.figures import draw_psf_sum
-from namod_ctl.app.psf_panels import psf_panels
+from namod_ctl.app.psf_panels import measured_panels
 from namod_ctl.core.units import rad2_to_arcmin2, rad_to_arcmin
 from namod_ctl.optics.instrument import Instrument
 from namod_ctl.reconstruction.reconstruct import reconstruct
@@ -22,7 +24,7 @@ from namod_ctl.store.run import RunStore
 
 REPORT_FOLDER = "report"
 HISTORY_FILE, FACETS_FILE, SUMMARY_FILE = "a_sigma_history.png", "facets.csv", "summary.txt"
-BEFORE_FILE, AFTER_FILE = "psf_before.png", "psf_after.png"
+PSF_FILE = "psf_before_and_after.png"
 
 
 def write_campaign_report(store: CampaignStore, instrument: Instrument) -> None:
@@ -34,10 +36,8 @@ def write_campaign_report(store: CampaignStore, instrument: Instrument) -> None:
         HISTORY_FILE: figure_to_png(draw_history(cycles, instrument.name)),
         FACETS_FILE: facet_text(cycles).encode(),
         SUMMARY_FILE: summary_text(store).encode(),
-        BEFORE_FILE: _psf_picture(store, cycles[0], instrument),
+        PSF_FILE: _psf_picture(store, cycles[:1] + cycles[-1:] if len(cycles) > 1 else cycles, instrument),
     }
-    if len(cycles) > 1:
-        files[AFTER_FILE] = _psf_picture(store, cycles[-1], instrument)
     folder = store.path / REPORT_FOLDER
     folder.mkdir(exist_ok=True)
     write_results(folder, files)
@@ -53,15 +53,22 @@ def draw_history(cycles: list[Cycle], telescope: str) -> Figure:
         for name in ("a_sigma_now_rad2", "a_sigma_uncertainty_rad2", "a_sigma_predicted_rad2")
     )
     axes.errorbar(numbers, now, yerr=doubt, fmt="o-", color="black", capsize=4, label="measured")
-    axes.plot(np.array(numbers) + 1, predicted, "D", color=ORANGE, fillstyle="none", label="predicted before")
+    made = np.array(numbers[:-1], dtype=int)  # the last one's correction was not made, or not seen
+    axes.plot(
+        made + 1, predicted[:-1], "D", color=ORANGE, fillstyle="none", ms=10, label="predicted by the cycle before"
+    )
     limit = rad2_to_arcmin2(cycles[-1].a_sigma_limit_rad2)
     if math.isfinite(limit):
         axes.axhline(limit, color=SKY, linestyle="--", label="ray-traced, mirrors without errors")
     for number, area in zip(numbers, now, strict=True):
         axes.annotate(f"{area:.1f}", (number, area), textcoords="offset points", xytext=(8, 6))
     axes.set_yscale("log")
-    axes.set_xticks(range(1, numbers[-1] + 2))
-    axes.set_xlim(0.7, numbers[-1] + 1.3)
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.set_ylim(0.8 * min(now.min(), limit if math.isfinite(limit) else now.min()), 1.3 * now.max())
+    axes.set_xticks(numbers)
+    axes.set_xlim(numbers[0] - 0.3, numbers[-1] + 0.5)
     axes.set_xlabel("cycle")
     axes.set_ylabel("A_sigma / arcmin$^2$")
     axes.set_title(f"{telescope}: area of the point spread function")
@@ -102,7 +109,11 @@ def summary_text(store: CampaignStore) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _psf_picture(store: CampaignStore, cycle: Cycle, instrument: Instrument) -> bytes:
-    with RunStore.open(store.run_path(cycle.number)) as run:
-        result = reconstruct(tabulate_responses(run.records(), run.facet_ids), instrument)
-    return figure_to_png(draw_psf_sum(psf_panels(result, instrument), instrument.name, result.limit))
+def _psf_picture(store: CampaignStore, cycles: Sequence[Cycle], instrument: Instrument) -> bytes:
+    """The point spread function as it was measured in these cycles, on one scale."""
+    results = []
+    for cycle in cycles:
+        with RunStore.open(store.run_path(cycle.number)) as run:
+            results.append(reconstruct(tabulate_responses(run.records(), run.facet_ids), instrument))
+    panels = measured_panels(results, [f"measured in cycle {cycle.number}" for cycle in cycles])
+    return figure_to_png(draw_psf_sum(panels, instrument.name, results[-1].limit))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -24,6 +25,7 @@ from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.motion import StopSwitch
 from namod_ctl.cycle.campaign_parts import CampaignSettings
+from namod_ctl.cycle.machine import FINAL
 from namod_ctl.cycle.record import RecordSettings
 from namod_ctl.store.campaign import CampaignStore
 from namod_ctl.twin.settings import TwinSettings
@@ -31,6 +33,9 @@ from namod_ctl.twin.settings import TwinSettings
 DEFAULT_CONFIG = "fact_actuated"
 DEFAULT_OUT = Path("CAMPAIGN")
 DEFAULT_SEED = 1
+DEFAULT_RECORDS = 400
+DEFAULT_CYCLES = 5
+NOTE_WISHES = "align.wishes"
 EXIT_HELD = 3  # the campaign ended, and a person must look
 
 
@@ -61,11 +66,16 @@ def align(
     resume: Annotated[
         Path | None, typer.Option("--resume", metavar="CAMPAIGN", help="Take up a campaign that was interrupted.")
     ] = None,
-    records: Annotated[int, typer.Option(min=50, help="Records per cycle.")] = 400,
-    cycles: Annotated[int, typer.Option(min=1, help="Corrections at most.")] = 5,
+    records: Annotated[
+        int | None, typer.Option(min=50, help=f"Records per cycle.  [{DEFAULT_RECORDS}, or as begun]")
+    ] = None,
+    cycles: Annotated[
+        int | None, typer.Option(min=1, help=f"Corrections at most.  [{DEFAULT_CYCLES}, or as begun]")
+    ] = None,
     approve: Annotated[
-        Approve, typer.Option(help="auto: corrections are carried out; ask: a person approves each one.")
-    ] = Approve.AUTO,
+        Approve | None,
+        typer.Option(help="auto: corrections are carried out; ask: a person approves each one.  [auto, or as begun]"),
+    ] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Of the twin: another seed is another telescope.")] = None,
     twin_settings: Annotated[
         Path | None, typer.Option("--twin-settings", metavar="FILE", help="Faults and sky of the twin, a TOML file.")
@@ -86,9 +96,9 @@ def align(
         else:
             start = _begun(stack, out or DEFAULT_OUT, config or DEFAULT_CONFIG, seed, twin_settings, force=force)
         store = start.store
-        if store.last_state() == "held":
-            raise ConfigError(f"{store.path}: is held; look why (namod-ctl status), then namod-ctl release")
-        wishes = CampaignSettings(RecordSettings(), records, cycles, approve is Approve.ASK)
+        if _has_ended(store, console):
+            return
+        wishes = _wishes(store, records, cycles, approve)
         switch = StopSwitch()
         view = stack.enter_context(AlignView(console))
         opened = stack.enter_context(
@@ -130,6 +140,35 @@ def _resumed(
     if noted is None:
         raise ConfigError(f"{path}: was not begun on the twin, and there are no drivers for cameras yet")
     return _Start(store, InstrumentConfig.from_json(store.config_json, f"{path}: config"), *noted)
+
+
+def _has_ended(store: CampaignStore, console: Console) -> bool:
+    """Says so when a campaign has converged before.
+
+    Raises ConfigError when it is held or has failed: a person must look.
+    """
+    last = store.last_transition()
+    if last is None or (state := store.last_state()) not in FINAL:
+        return False
+    why = f"{state}: {last.data.get('reason')}"
+    if state == "converged":
+        text = f"{store.path}: has {why}; there is nothing to do. Begin another campaign to align it anew."
+        console.print(text, soft_wrap=True, markup=False)
+        return True
+    remedy = f"look why, then 'namod-ctl release {store.path}'" if state == "held" else "begin another campaign"
+    raise ConfigError(f"{store.path}: is {why}; {remedy}")
+
+
+def _wishes(store: CampaignStore, records: int | None, cycles: int | None, approve: Approve | None) -> CampaignSettings:
+    """What the crew wishes; noted in the campaign, which goes on with it after a restart."""
+    given = {"records": records, "cycles": cycles, "approve": approve}
+    wishes = {"records": DEFAULT_RECORDS, "cycles": DEFAULT_CYCLES, "approve": Approve.AUTO}
+    wishes |= json.loads(store.note(NOTE_WISHES) or "{}")
+    wishes |= {name: wish for name, wish in given.items() if wish is not None}
+    store.set_note(NOTE_WISHES, json.dumps(wishes))
+    return CampaignSettings(
+        RecordSettings(), int(wishes["records"]), int(wishes["cycles"]), wishes["approve"] == Approve.ASK
+    )
 
 
 @contextmanager
