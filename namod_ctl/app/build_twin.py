@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +13,8 @@ from pydantic import TypeAdapter, ValidationError
 
 from namod_ctl.app.build import build_instrument
 from namod_ctl.app.config import InstrumentConfig
+from namod_ctl.app.twin_limits import Origins, as_written, beyond_limits, in_radians
 from namod_ctl.core.errors import ConfigError
-from namod_ctl.core.units import arcmin_to_rad, arcsec_to_rad, deg_to_rad
 from namod_ctl.optics.camera_model import CameraModel
 from namod_ctl.optics.instrument import Instrument
 from namod_ctl.optics.reflector import Reflector
@@ -28,13 +27,6 @@ from namod_ctl.twin.twin import Twin
 
 IMAGE_MARGIN_SHARE = 0.02
 """Of the image's width: a lens is chosen so that the dish leaves that much free."""
-
-ANGLES: Mapping[str, Callable[[float], float]] = {
-    "deg": deg_to_rad,
-    "arcmin": arcmin_to_rad,
-    "arcsec": arcsec_to_rad,
-}
-POSITIVE = ("spacing_rad", "speed_rad_per_s", "exposure_at_mag0_s", "electrons_per_adu", "exposure_step_s")
 
 
 def load_twin_settings(path: str | Path) -> TwinSettings:
@@ -53,50 +45,37 @@ def load_twin_settings(path: str | Path) -> TwinSettings:
     except ValueError as error:
         raise ConfigError(f"{path}: not valid TOML: {error}") from None
     problems: list[str] = []
-    raw = _in_radians(raw, str(path), problems)
+    origins: Origins = {}
+    raw = in_radians(raw, origins, problems)
+    problems += beyond_limits(raw, origins)
     for camera, default in (("star_camera", STAR_CAMERA), ("reflector_camera", REFLECTOR_CAMERA)):
         if isinstance(raw.get(camera), dict):  # these two have defaults of their own
             own = {"exposure_at_mag0_s": default.exposure_at_mag0_s, "background_share": default.background_share}
             raw[camera] = own | raw[camera]
+    settings = TwinSettings()
     try:
         settings = TypeAdapter(TwinSettings).validate_python(raw)
     except ValidationError as error:
         problems += [
-            f"{path}: {'.'.join(map(str, detail['loc']))} = {detail['input']!r}: {detail['msg']}"
-            for detail in error.errors()
+            f"{as_written(detail['loc'], origins)} = {detail['input']!r}: {detail['msg']}" for detail in error.errors()
         ]
-        raise ConfigError("\n".join(problems)) from None
+    for camera, used in (("star_camera", settings.star_camera), ("reflector_camera", settings.reflector_camera)):
+        shortest_s, longest_s = used.exposure_range_s
+        if not shortest_s < longest_s:
+            problems.append(f"{camera}.exposure_range_s = {[shortest_s, longest_s]}: the first must be the shorter")
+    problems += _fault_problems(settings) if not problems else []
+    if problems:
+        raise ConfigError("\n".join(f"{path}: {problem}" for problem in problems))
+    return settings
+
+
+def _fault_problems(settings: TwinSettings) -> Iterator[str]:
     plan = FaultPlan()
     for number, fault in enumerate(settings.faults):
         try:
             plan.inject(fault)
         except ConfigError as problem:
-            problems.append(f"{path}: faults.{number}: {problem}")
-    if problems:
-        raise ConfigError("\n".join(problems))
-    return settings
-
-
-def _in_radians(section: Mapping[str, Any], where: str, problems: list[str]) -> dict[str, Any]:
-    """The section with its angles in rad; values that must be positive and are not go into `problems`."""
-    converted: dict[str, Any] = {}
-    for key, value in section.items():
-        name, new = key, value
-        if isinstance(value, dict):
-            new = _in_radians(value, f"{where}: {key}", problems)
-        elif isinstance(value, list):
-            new = [_in_radians(v, f"{where}: {key}", problems) if isinstance(v, dict) else v for v in value]
-        words = key.split("_")
-        for unit in ANGLES.keys() & set(words[1:]):
-            name = "_".join("rad" if word == unit else word for word in words)
-            numbers = new if isinstance(new, list) else [new]
-            if all(isinstance(number, int | float) for number in numbers):
-                angles = [ANGLES[unit](float(number)) for number in numbers]
-                new = angles if isinstance(new, list) else angles[0]
-        if name in POSITIVE and isinstance(value, int | float) and not value > 0.0:
-            problems.append(f"{where}: {key} = {value!r}: must be positive")
-        converted[name] = new
-    return converted
+            yield f"faults.{number}: {problem}"
 
 
 def build_twin(config: InstrumentConfig, settings: TwinSettings, seed: int, wiring: Sequence[BusWiring] = ()) -> Twin:

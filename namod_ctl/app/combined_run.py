@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -13,20 +14,19 @@ import numpy as np
 
 from namod_ctl.app.build import build_instrument
 from namod_ctl.app.config import InstrumentConfig
+from namod_ctl.app.twin_note import NOTE_SEED, NOTE_SETTINGS
 from namod_ctl.core.clock import Clock
 from namod_ctl.core.errors import ConfigError, DataQualityError
 from namod_ctl.core.records import Record
+from namod_ctl.core.units import rad_to_arcmin
 from namod_ctl.cycle.record import SESSION_GAP_S
 from namod_ctl.reconstruction.reconstruct import MIN_RECORDS, expected_size_rad
 from namod_ctl.reconstruction.responses import tabulate_responses
 from namod_ctl.reconstruction.run_comparison import RunComparison, compare_runs
 from namod_ctl.store.combine import NOTE_COMBINED, RunPart, check_combined_output, merge_records, new_combined_run
 from namod_ctl.store.run import RunStore
+from namod_ctl.twin.settings import TwinSettings
 
-MAX_MOVED_SHARE = 0.5
-"""Of the compared facets: when more have moved, the mirror or the star camera was worked on between the runs."""
-
-MIN_COMPARED = 3
 _MAX_DIFFERENCES = 8
 
 
@@ -38,6 +38,8 @@ class _Run:
     config: InstrumentConfig
     config_json: str
     made: datetime
+    twin: str
+    """Which twin it was recorded with, for comparison; empty without one."""
 
 
 @contextmanager
@@ -111,8 +113,20 @@ def _read(paths: Sequence[Path], out: Path) -> list[_Run]:
                 )
             part = RunPart(path.name if is_unique else str(given), store.facet_ids, tuple(store.records()))
             config = InstrumentConfig.from_json(store.config_json, f"{given}: config")
-            runs.append(_Run(part, config, store.config_json, datetime.fromisoformat(store.created_utc)))
+            made = datetime.fromisoformat(store.created_utc)
+            runs.append(_Run(part, config, store.config_json, made, _twin_in_words(store)))
     return sorted(runs, key=lambda run: run.made)
+
+
+def _twin_in_words(store: RunStore) -> str:
+    """Seed and mirror of the twin that a run was recorded with; another one is another telescope."""
+    seed, settings = store.note(NOTE_SEED), store.note(NOTE_SETTINGS)
+    if seed is None:
+        return ""
+    reflector = {} if settings is None else json.loads(settings).get("reflector", {})
+    default = asdict(TwinSettings().reflector)
+    changed = [f"{key} = {value}" for key, value in reflector.items() if value != default.get(key)]
+    return ", ".join([f"seed {seed}", *changed])
 
 
 def _refuse_other_telescopes(runs: Sequence[_Run]) -> None:
@@ -120,6 +134,8 @@ def _refuse_other_telescopes(runs: Sequence[_Run]) -> None:
     newest = runs[-1]
     problems = []
     for run in runs[:-1]:
+        if run.twin and newest.twin and run.twin != newest.twin:
+            problems.append(f"{run.part.name}: is of the twin of {run.twin}, {newest.part.name} of {newest.twin}")
         only = set(run.part.facet_ids) ^ set(newest.part.facet_ids)
         if only:
             problems.append(
@@ -173,14 +189,12 @@ def _compare(
 
 def _refuse_moved_mirror(runs: Sequence[_Run], comparisons: Sequence[RunComparison | None]) -> None:
     for run, comparison in zip(runs, comparisons, strict=True):
-        if comparison is None or comparison.n_compared < MIN_COMPARED:
-            continue
-        n_moved = len(comparison.moved_facet_ids)
-        if n_moved > MAX_MOVED_SHARE * comparison.n_compared:
+        if comparison is not None and comparison.is_other_mirror:
             raise DataQualityError(
-                f"{run.part.name}: {n_moved} of {comparison.n_compared} facets stand elsewhere than in the other runs: "
-                "were bolts turned, or was the star camera touched in between? Only runs of the mirror as it is now "
-                "belong together: leave the older ones out"
+                f"{run.part.name}: its facets stand elsewhere than in the other runs (by "
+                f"{rad_to_arcmin(comparison.distance_rad):.1f} arcmin, the median of {comparison.n_compared} facets): "
+                "is it another telescope, were bolts turned, or was the star camera touched in between? Only runs of "
+                "the mirror as it is now belong together: leave the older ones out"
             )
 
 
@@ -201,7 +215,14 @@ def _scale_text(comparison: RunComparison | None) -> str:
 
 
 def _moved_text(comparison: RunComparison | None) -> str:
-    if comparison is None or not comparison.moved_facet_ids:
+    if comparison is None:
+        return ""
+    if comparison.is_other_mirror is None:
+        return (
+            f"; NOT CHECKED whether it is of the same mirror: only {comparison.n_compared} facets were seen well "
+            "enough in it and in the others"
+        )
+    if not comparison.moved_facet_ids:
         return ""
     ids = ", ".join(map(str, comparison.moved_facet_ids))
     return f"; LOOK AT facets {ids}: they seem to stand elsewhere than in the others"

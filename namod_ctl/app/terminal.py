@@ -32,7 +32,7 @@ class TerminalView:
         self._console, self._title = console, title
         self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
         self._shown_s = -math.inf
-        self._warning = ""
+        self._is_warned = self._is_halted = False
 
     def __enter__(self) -> Self:
         if self._live is not None:
@@ -48,11 +48,12 @@ class TerminalView:
     def show(self, progress: Progress, *, now: bool = False) -> None:
         """Show the progress, but not more often than people can read unless it must be `now`."""
         time_s = time.monotonic()
-        is_news = bool(progress.warning) and not self._warning
+        is_news = (bool(progress.warning) and not self._is_warned) or progress.is_halted != self._is_halted
         interval_s = PLAIN_LINE_S if self._live is None else REFRESH_S
         if not (now or is_news) and time_s - self._shown_s < interval_s:
             return
-        self._shown_s, self._warning = time_s, progress.warning
+        self._shown_s = time_s
+        self._is_warned, self._is_halted = bool(progress.warning), progress.is_halted
         if self._live is not None:
             self._live.update(_panel(progress, self._title), refresh=True)
         else:

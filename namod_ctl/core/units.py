@@ -97,6 +97,11 @@ def m_to_mm(length_m: T) -> T:
     return length_m * 1000.0
 
 
+def m_to_um(length_m: T) -> T:
+    """Metres as micrometres (how far a leg stands from its target)."""
+    return length_m * 1.0e6
+
+
 def um_to_m(length_um: T) -> T:
     """Micrometres (backlash in configs) as metres."""
     return length_um / 1.0e6

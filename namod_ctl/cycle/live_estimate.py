@@ -70,9 +70,15 @@ class LiveEstimate:
 
 
 class LiveEstimator:
-    """Estimates the run at `path` now and then; a context manager that ends its process."""
+    """Estimates the run at `path` now and then, in a process of its own until `close`.
 
-    def __init__(self, path: Path, instrument: Instrument) -> None:
+    Parameters
+    ----------
+    is_waited_for
+        The recording can wait for every estimate that is due, as the twin can, whose time does not pass meanwhile.
+    """
+
+    def __init__(self, path: Path, instrument: Instrument, *, is_waited_for: bool = False) -> None:
         context = get_context("spawn")
         self._connection, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(theirs, path, instrument), daemon=True)
@@ -84,7 +90,8 @@ class LiveEstimator:
         finally:
             signal.signal(signal.SIGINT, before)
         theirs.close()
-        self._is_busy = False
+        self._is_busy = self._is_lost = False
+        self._is_waited_for = is_waited_for
         self._asked_at = 0
         self.latest: LiveEstimate | None = None
 
@@ -98,8 +105,17 @@ class LiveEstimator:
                 self._connection.send(None)
                 self._is_busy, self._asked_at = True, n_accepted
         except (EOFError, OSError):  # its process is gone, perhaps for lack of memory: recording matters more
-            self._is_busy = True
+            self._is_busy = self._is_lost = True
         return self.latest
+
+    def is_ready(self, timeout_s: float) -> bool:
+        """Can the recording go on? Waits for an estimate under way, if it is to be waited for, so long at most."""
+        if not self._is_waited_for or not self._is_busy or self._is_lost:
+            return True
+        try:
+            return self._connection.poll(timeout_s)
+        except (EOFError, OSError):
+            return True
 
     def close(self) -> None:
         """End the process, whatever it does."""

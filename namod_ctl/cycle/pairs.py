@@ -12,7 +12,7 @@ import math
 import threading
 from collections import Counter, deque
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from enum import StrEnum
 from types import TracebackType
@@ -67,18 +67,42 @@ class SourceExhaustedError(Exception):
     """A camera of stored frames has shown its last one."""
 
 
+class TimeIsUpError(Exception):
+    """The moment has come from which on no more pairs are begun."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Pair:
-    """Two exposures made at the same time, and the time of day when they were done."""
+    """Two exposures made at the same time, and the time of day when they were done.
+
+    `look` is a second exposure of the star right after them, where the pair before is too long ago to tell how fast
+    the telescope moves.
+    """
 
     star: Exposure
     reflector: Exposure
     done: datetime
+    look: Exposure | None = None
+
+    @property
+    def end_s(self) -> float:
+        """When the last of its exposures ended, on the cameras' clock."""
+        exposures = [exposure for exposure in (self.star, self.reflector, self.look) if exposure is not None]
+        return max(exposure.mid_exposure_s + exposure.exposure_s / 2.0 for exposure in exposures)
+
+
+@dataclass(slots=True, eq=False)
+class _Taking:
+    """A pair that is being taken, or waits to be used, and what befell the cameras until it was good."""
+
+    future: Future[Pair | None] = field(init=False)
+    dropped: Counter[DropCause] = field(default_factory=Counter)
+    n_frames_missed: int = 0
 
 
 @dataclass(frozen=True, slots=True)
 class SourceStatus:
-    """How the cameras are doing.
+    """How the cameras are doing. What befell pairs that nobody has asked for yet does not count.
 
     Attributes
     ----------
@@ -165,6 +189,13 @@ class PairSource:
         How long after its exposure a frame is waited for.
     pace_s
         From the start of one pair to that of the next, at least.
+    look_after_s
+        A pair that comes so long after the one before gets a second look at the star; None: none does.
+
+    Attributes
+    ----------
+    end_s
+        On the cameras' clock: from then on no pair is begun.
     """
 
     def __init__(
@@ -176,22 +207,27 @@ class PairSource:
         max_retakes: int,
         timeout_s: float,
         pace_s: float = 0.0,
+        look_after_s: float | None = None,
     ) -> None:
+        self.end_s = math.inf
         self._star, self._reflector = star, reflector
         self._clock, self._wall_clock = clock, wall_clock
         self._max_retakes, self._timeout_s, self._pace_s = max_retakes, timeout_s, pace_s
+        self._look_after_s, self._star_seen_s = look_after_s, -math.inf
         self._next_start_s = clock.monotonic_s()
         self._star_worker = ThreadPoolExecutor(1, "star_camera")
         self._reflector_worker = ThreadPoolExecutor(1, "reflector_camera")
-        self._in_flight: deque[Future[Pair | None]] = deque()
+        self._in_flight: deque[_Taking] = deque()
         self._is_closing = threading.Event()
         self._lock = threading.Lock()
         self._dropped: Counter[DropCause] = Counter()
+        self._n_frames_missed = 0
+        self._is_awaited = False
         self._trouble = ""
 
     def __enter__(self) -> Self:
         for _ in range(PAIRS_AHEAD):
-            self._in_flight.append(self._star_worker.submit(self._take, math.inf))
+            self._submit(math.inf)
         return self
 
     def __exit__(
@@ -214,34 +250,56 @@ class PairSource:
         ------
         SourceExhaustedError
             There are no more.
+        TimeIsUpError
+            It would have begun after `end_s`.
         """
+        self._is_awaited = True
         try:
-            pair = self._in_flight[0].result(timeout_s)
+            pair = self._in_flight[0].future.result(timeout_s)
         except TimeoutError:
             return None
-        self._in_flight.popleft()
-        self._in_flight.append(self._star_worker.submit(self._take, longest_s))
+        with self._lock:
+            taken = self._in_flight.popleft()
+            self._dropped.update(taken.dropped)
+            self._n_frames_missed = taken.n_frames_missed
+            self._is_awaited = False
+        self._submit(longest_s)
         return pair
 
     @property
     def status(self) -> SourceStatus:
-        """How the cameras are doing at this moment."""
-        with self._lock:
-            dropped = {cause: self._dropped[cause] for cause in DropCause if self._dropped[cause]}
-            missed = self._star.n_frames_missed + self._reflector.n_frames_missed
-            return SourceStatus(dropped, missed, self._trouble)
+        """How the cameras are doing at this moment.
 
-    def _take(self, longest_s: float) -> Pair | None:
+        Of pairs that are taken ahead, only that which is waited for counts: how far ahead the cameras are depends on
+        how fast the computer is, and a twin's recording can be repeated.
+        """
+        with self._lock:
+            dropped, missed = self._dropped.copy(), self._n_frames_missed
+            if self._is_awaited:
+                dropped.update(self._in_flight[0].dropped)
+                missed = max(missed, self._in_flight[0].n_frames_missed)
+            return SourceStatus({cause: dropped[cause] for cause in DropCause if dropped[cause]}, missed, self._trouble)
+
+    def _submit(self, longest_s: float) -> None:
+        taking = _Taking()
+        taking.future = self._star_worker.submit(self._take, longest_s, taking)
+        self._in_flight.append(taking)
+
+    def _take(self, longest_s: float, taking: _Taking) -> Pair | None:
         """The next pair that is good; None when the source is being closed. Runs in the star camera's thread."""
         n_retakes = 0
         self._star.limit(longest_s)
         self._reflector.limit(longest_s)
+        if self._next_start_s >= self.end_s:
+            raise TimeIsUpError
         early_s = self._next_start_s - self._clock.monotonic_s()
         if early_s > 0.0 and not self._is_closing.is_set():
             self._clock.wait_s(early_s)
         self._next_start_s = max(self._next_start_s, self._clock.monotonic_s()) + self._pace_s
         while not self._is_closing.is_set():
-            if not self._start_both():
+            if self._clock.monotonic_s() >= self.end_s:
+                raise TimeIsUpError
+            if not self._start_both(taking):
                 self._clock.wait_s(LOST_CAMERA_RETRY_S)
                 continue
             reflector_done = self._reflector_worker.submit(self._reflector.finish, self._timeout_s)
@@ -250,16 +308,31 @@ class PairSource:
             causes = [cause for cause in (star_cause, reflector_cause) if cause is not None]
             is_complete = star is not None and reflector is not None
             if star is not None and reflector is not None and (not causes or n_retakes >= self._max_retakes):
-                self._note((), "")
-                return Pair(star, reflector, self._wall_clock.now())
+                self._note(taking, (), "")
+                return Pair(star, reflector, self._wall_clock.now(), self._second_look(star))
             details = [d for d, c in ((star_detail, star_cause), (reflector_detail, reflector_cause)) if c is not None]
-            self._note(causes, "; ".join(details))
+            self._note(taking, causes, "; ".join(details))
             n_retakes += is_complete
             if DropCause.CAMERA_LOST in causes:
                 self._clock.wait_s(LOST_CAMERA_RETRY_S)
         return None
 
-    def _start_both(self) -> bool:
+    def _second_look(self, star: Exposure) -> Exposure | None:
+        """The star once more, right after a pair that follows the one before too late; None elsewhere, or in vain."""
+        since_s, self._star_seen_s = star.mid_exposure_s - self._star_seen_s, star.mid_exposure_s
+        if self._look_after_s is None or since_s <= self._look_after_s:
+            return None
+        for _ in range(self._max_retakes + 1):
+            try:
+                self._star.camera.start(self._star.exposure_s)
+            except DeviceFaultError:
+                return None  # the next pair says so
+            look, cause, _ = self._star.finish(self._timeout_s)
+            if look is not None and cause is None:
+                return look
+        return None
+
+    def _start_both(self, taking: _Taking) -> bool:
         """Start both exposures, the longer first and the shorter in its middle; False when a camera is lost."""
         first, second = sorted((self._reflector, self._star), key=lambda line: -line.exposure_s)
         lead_s = 0.5 * (first.exposure_s - second.exposure_s)
@@ -269,17 +342,18 @@ class PairSource:
             try:
                 line.camera.start(line.exposure_s)
             except DeviceFaultError as error:
-                self._note((DropCause.CAMERA_LOST,), str(error))
+                self._note(taking, (DropCause.CAMERA_LOST,), str(error))
                 if line is second:
                     first.finish(self._timeout_s)
                 return False
         return True
 
-    def _note(self, causes: tuple[DropCause, ...] | list[DropCause], trouble: str) -> None:
+    def _note(self, taking: _Taking, causes: tuple[DropCause, ...] | list[DropCause], trouble: str) -> None:
         if self._is_closing.is_set():  # a camera that is closed delivers nothing, and that is no news
             return
         with self._lock:
-            self._dropped.update(causes)
+            taking.dropped.update(causes)
+            taking.n_frames_missed = self._star.n_frames_missed + self._reflector.n_frames_missed
             self._trouble = trouble
 
 

@@ -16,6 +16,8 @@ from namod_ctl.cycle.live_estimate import LiveEstimate
 from namod_ctl.cycle.pairs import DropCause, SourceStatus
 
 WARN_AFTER_S = 30.0
+WARN_AFTER_PACES = 4.0
+"""With so many pairs at least behind it: one that is rejected by chance is no trouble."""
 RATE_OVER_S = 60.0
 MAX_RECENT = 10_000
 """Records looked back on: more than a minute has, and few enough to keep."""
@@ -69,7 +71,10 @@ class Progress:
     trouble
         What is wrong at this moment; empty when nothing is.
     warning
-        What has been wrong for `WARN_AFTER_S`, and what to do about it; empty when nothing has.
+        What stops the recording, or has been wrong for `WARN_AFTER_S` and some pairs, and what to do about it; empty
+        when nothing is.
+    is_halted
+        The recording stands still for something that is wrong with the computer, such as a full disk.
     """
 
     n_accepted: int
@@ -88,6 +93,7 @@ class Progress:
     estimate: LiveEstimate | None
     trouble: str
     warning: str
+    is_halted: bool = False
 
 
 @dataclass(slots=True)
@@ -97,6 +103,7 @@ class Tracker:
     region_radius_rad: float
     start_s: float
     star_zero_point_mag: float | None = None
+    pace_s: float = 0.0
     n_wanted: int | None = None
     n_accepted: int = 0
     rejected: Counter[RejectReason] = field(default_factory=Counter)
@@ -130,7 +137,7 @@ class Tracker:
     def snapshot(
         self, now_s: float, source: SourceStatus, estimate: LiveEstimate | None, trouble: str = ""
     ) -> Progress:
-        """The state at this moment; `trouble` of the computer takes precedence over that of the cameras."""
+        """The state at this moment; `trouble` of the computer, which stops the recording, hides all other."""
         last = self.last
         theta_rad = np.full(2, np.nan) if last is None else last.theta_rad
         zero_point_mag = self.star_zero_point_mag
@@ -152,7 +159,8 @@ class Tracker:
             coverage=self.coverage,
             estimate=estimate,
             trouble=trouble or source.trouble,
-            warning=self._warning(now_s, source),
+            warning=trouble or self._warning(now_s, source),
+            is_halted=bool(trouble),
         )
 
     def _count(self, record: Record) -> None:
@@ -161,7 +169,7 @@ class Tracker:
         self.brightest_star = max(self.brightest_star, record.star_intensity)
 
     def _warning(self, now_s: float, source: SourceStatus) -> str:
-        if now_s - self.last_accepted_s < WARN_AFTER_S:
+        if now_s - self.last_accepted_s < max(WARN_AFTER_S, WARN_AFTER_PACES * self.pace_s):
             return ""
         since = Counter({cause: n - self.dropped_before.get(cause, 0) for cause, n in source.dropped.items()})
         rejected = Counter(
@@ -193,6 +201,8 @@ def warning_text(wrong_for_s: float, rejected: Counter[RejectReason], dropped: C
     if n_rejected >= n_dropped:
         reason = rejected.most_common(1)[0][0]
         remedy = _REMEDY_OF_REJECTION.get(reason, "look at the frames")
-        return f"{text}: {REJECT_REASON_MEANING[reason]} ({n_rejected} records); {remedy}"
+        records = "1 record" if n_rejected == 1 else f"{n_rejected} records"
+        return f"{text}: {REJECT_REASON_MEANING[reason]} ({records}); {remedy}"
     cause = dropped.most_common(1)[0][0]
-    return f"{text}: {cause} ({n_dropped} times); {_REMEDY_OF_DROP[cause]}"
+    times = "once" if n_dropped == 1 else f"{n_dropped} times"
+    return f"{text}: {cause} ({times}); {_REMEDY_OF_DROP[cause]}"

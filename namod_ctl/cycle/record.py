@@ -6,15 +6,12 @@ same path for the sky, the twin and stored frames (`replay`).
 
 from __future__ import annotations
 
-import errno
 import json
 import math
-import sqlite3
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from datetime import datetime, timedelta
 
 import cv2
 import numpy as np
@@ -25,10 +22,18 @@ from namod_ctl.core.errors import ConfigError, StoreError
 from namod_ctl.core.interfaces import Camera, MonotonicClock
 from namod_ctl.core.records import Record
 from namod_ctl.core.units import deg_to_rad
+from namod_ctl.cycle.disk_trouble import is_mended_by_waiting
 from namod_ctl.cycle.live_estimate import LiveEstimator
-from namod_ctl.cycle.motion import judge_motion, speed_rad_per_s
-from namod_ctl.cycle.pairs import CameraLine, Pair, PairSource, SourceExhaustedError
+from namod_ctl.cycle.motion import (
+    MAX_SPEED_BASE_S,
+    judge_motion,
+    speed_from_before,
+    speed_from_look,
+    with_stored_verdict,
+)
+from namod_ctl.cycle.pairs import CameraLine, Pair, PairSource, SourceExhaustedError, TimeIsUpError
 from namod_ctl.cycle.progress import Progress, Tracker
+from namod_ctl.cycle.wall_clock import WallClockWatch
 from namod_ctl.imaging.exposure import exposure_rule
 from namod_ctl.imaging.facets import FacetPhotometer
 from namod_ctl.imaging.measure import measure_record
@@ -55,12 +60,8 @@ N_SPEEDS = 5
 MOTION_MARGIN = 0.8
 """Of the longest exposure that the telescope's motion allows: it may quicken a little."""
 
-CLOCK_STEP = timedelta(seconds=1)
 SESSION_GAP_S = 60.0
 """Between two sessions of a run, in its own time: more than lies between two records."""
-
-_DISK_ERRNOS = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.ENOENT, errno.ESTALE)
-_DISK_CODES = (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_BUSY, sqlite3.SQLITE_CANTOPEN)
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +114,7 @@ class StopRule:
     n_records
         Records that count, in the whole run.
     duration_s
-        Of this session, on the cameras' clock.
+        Of this session, on the cameras' clock: pairs that were begun before count. The cameras keep it, see `pairs`.
     uncertainty_rad
         Of the facet that is known worst. Facets that were not seen hold it up until the region is covered.
     """
@@ -127,8 +128,6 @@ class StopRule:
         estimate = progress.estimate
         if self.n_records is not None and progress.n_accepted >= self.n_records:
             return "all records wanted are there"
-        if self.duration_s is not None and progress.elapsed_s >= self.duration_s:
-            return f"{progress.elapsed_s / 60.0:.1f} minutes are over"
         if self.uncertainty_rad is None or estimate is None or estimate.n_records < MIN_RECORDS_FOR_UNCERTAINTY:
             return ""
         unseen = estimate.unseen_facet_ids
@@ -167,7 +166,7 @@ class Recorder:
     estimator
         For the live estimate; None does without.
     replayed
-        Index and label of the records whose frames the cameras replay; None records anew.
+        The records whose frames the cameras replay; None records anew.
 
     Raises
     ------
@@ -182,7 +181,7 @@ class Recorder:
         store: RunStore,
         settings: RecordSettings,
         estimator: LiveEstimator | None = None,
-        replayed: Iterator[tuple[int, str]] | None = None,
+        replayed: Iterator[Record] | None = None,
     ) -> None:
         self._equipment, self._instrument, self._store = equipment, instrument, store
         self._settings, self._estimator, self._replayed = settings, estimator, replayed
@@ -197,7 +196,8 @@ class Recorder:
         times_s = [record.star_mid_exposure_s for record in earlier if np.isfinite(record.star_mid_exposure_s)]
         # A run's time begins with its first session and only ever grows; a replay has it already.
         self._offset_s = (max(times_s) + SESSION_GAP_S if times_s else 0.0) - now_s if replayed is None else 0.0
-        self._tracker = Tracker(settings.region_radius_rad, now_s, settings.star_zero_point_mag)
+        pace_s = settings.pace_s if replayed is None else 0.0
+        self._tracker = Tracker(settings.region_radius_rad, now_s, settings.star_zero_point_mag, pace_s)
         for record in earlier:
             self._tracker.add_earlier(record)
         self._source = PairSource(
@@ -207,11 +207,12 @@ class Recorder:
             equipment.wall_clock,
             settings.max_retakes if replayed is None else 0,
             settings.fetch_timeout_s,
-            settings.pace_s if replayed is None else 0.0,
+            pace_s,
+            MAX_SPEED_BASE_S if replayed is None else None,
         )
         self._speeds: deque[float] = deque(maxlen=N_SPEEDS)
         self._is_asked_to_stop = threading.Event()
-        self._last_wall: datetime | None = None
+        self._wall_clock = WallClockWatch()
         self.events: list[str] = []
         """What befell the recording besides rejected records, one sentence each."""
 
@@ -230,7 +231,11 @@ class Recorder:
             The frames are not of the instrument's cameras.
         """
         self._tracker.n_wanted = stop.n_records
-        reason = ""
+        reason = stop.reason_to_stop(self.progress())
+        if reason:
+            return reason
+        if stop.duration_s is not None:
+            self._source.end_s = self._tracker.start_s + stop.duration_s
         try:
             with self._source:
                 while not reason:
@@ -243,21 +248,40 @@ class Recorder:
                         if not self._store_patiently(record, pair, on_progress):
                             reason = "stopped by hand; the last record could not be stored"
                             break
-                        now_s = self._equipment.clock.monotonic_s()
-                        self._tracker.add(record, now_s, self._source.status)
-                    progress = self.progress()
+                        self._tracker.add(record, self._end_s(pair), self._source.status)
+                        self._wait_for_estimate(stop, on_progress)
+                    progress = self.progress(pair=pair)
                     on_progress(progress)
                     reason = stop.reason_to_stop(progress)
         except SourceExhaustedError:
             reason = "all frames are replayed"
+        except TimeIsUpError:
+            reason = f"{(stop.duration_s or 0.0) / 60.0:.3g} minutes are over"
+            on_progress(self.progress())
         self._note_session(reason)
         return reason
 
-    def progress(self, trouble: str = "") -> Progress:
-        """The state of the recording."""
+    def progress(self, trouble: str = "", pair: Pair | None = None) -> Progress:
+        """The state of the recording, at the end of that pair or at this moment.
+
+        With `trouble` the recording stands still.
+        """
         estimate = None if self._estimator is None else self._estimator.update(self._tracker.n_accepted)
-        now_s = self._equipment.clock.monotonic_s()
+        now_s = self._equipment.clock.monotonic_s() if pair is None else self._end_s(pair)
         return self._tracker.snapshot(now_s, self._source.status, estimate, trouble)
+
+    def _end_s(self, pair: Pair) -> float:
+        """When the pair ended: the cameras may be ahead of us, and a twin's clock by far."""
+        now_s = self._equipment.clock.monotonic_s()
+        return pair.end_s if self._replayed is None and math.isfinite(pair.end_s) else now_s
+
+    def _wait_for_estimate(self, stop: StopRule, on_progress: Callable[[Progress], None]) -> None:
+        """Where the cameras' time stands still meanwhile, the rule of uncertainty waits for what it judges."""
+        if stop.uncertainty_rad is None or self._estimator is None:
+            return
+        self._estimator.update(self._tracker.n_accepted)
+        while not self._is_asked_to_stop.is_set() and not self._estimator.is_ready(POLL_S):
+            on_progress(self.progress())
 
     def _line(
         self, role: str, camera: Camera, model: CameraModel, region: NDArray[np.uint8] | None = None
@@ -277,12 +301,13 @@ class Recorder:
         return region
 
     def _measured(self, pair: Pair) -> Record:
-        if self._replayed is not None:
-            index, label = next(self._replayed)
+        stored = None if self._replayed is None else next(self._replayed)
+        if stored is not None:
+            index, label = stored.index, stored.label
         else:
             index = self._next_index
             label = f"{pair.done:%Y%m%dT%H%M%S}_{index:06d}"
-            self._watch_wall_clock(pair.done)
+            self.events += filter(None, [self._wall_clock.step(pair.done)])
         record = replace(
             measure_record(
                 pair.star.image,
@@ -299,8 +324,12 @@ class Recorder:
         )
         if not np.isfinite(record.theta_rad).all():
             return record
-        speed = speed_rad_per_s(self._before, record)
+        speed = speed_from_before(self._before, record)
         self._before = record
+        if stored is not None and math.isnan(speed):
+            return with_stored_verdict(record, stored)
+        if math.isnan(speed):
+            speed = speed_from_look(pair, record, self._instrument)
         self._speeds.append(speed)
         return judge_motion(record, speed, self._settings.max_motion_share * self._instrument.star_size_rad)
 
@@ -311,15 +340,6 @@ class Recorder:
             return math.inf
         limit_rad = self._settings.max_motion_share * self._instrument.star_size_rad
         return max(MOTION_MARGIN * limit_rad / float(np.median(known)), self._settings.first_exposure_s)
-
-    def _watch_wall_clock(self, now: datetime) -> None:
-        if self._last_wall is not None and now < self._last_wall - CLOCK_STEP:
-            back = self._last_wall - now
-            self.events.append(
-                f"the computer's clock was set back by {back}: labels go back with it, the records' order and times "
-                "do not"
-            )
-        self._last_wall = now
 
     def _store_patiently(self, record: Record, pair: Pair, on_progress: Callable[[Progress], None]) -> bool:
         """Put the record on the disk; wait for a full one. False when somebody asks to stop meanwhile."""
@@ -333,7 +353,8 @@ class Recorder:
                 if not is_waiting:
                     self.events.append(f"record {record.index} had to wait for the disk: {error}")
                 is_waiting = True
-                on_progress(self.progress(f"{error}; trying again every {self._settings.store_retry_s:g} s"))
+                wait = f"NOTHING IS RECORDED; trying again every {self._settings.store_retry_s:g} s"
+                on_progress(self.progress(f"{error}; {wait}"))
                 if self._is_asked_to_stop.wait(self._settings.store_retry_s):
                     return False
             else:
@@ -367,11 +388,3 @@ class Recorder:
             self._store.set_note(NOTE_SESSIONS, json.dumps(sessions))
         except StoreError as error:
             self.events.append(f"the session's counts could not be noted in the run: {error}")
-
-
-def is_mended_by_waiting(error: StoreError) -> bool:
-    """True for a disk that is full, gone or busy; False for a run that is damaged."""
-    cause = error.__cause__
-    if isinstance(cause, sqlite3.Error):
-        return getattr(cause, "sqlite_errorcode", -1) & 0xFF in _DISK_CODES
-    return isinstance(cause, OSError) and cause.errno in _DISK_ERRNOS

@@ -5,21 +5,27 @@ calibration changes all responses of a run by one factor. The facets themselves 
 and the logs of the factors are further parameters of that fit. Every facet adds what its records say about them when
 its own parameters and each run's background are left free (the Schur complement of its normal equations), so that a
 facet that was lit in one run only says nothing.
+
+Whether it is the same mirror, the facets tell together, also where each was lit a few times only: by the median of
+their distances from run to run in units of the joint errors. A few centres that a sparse run gets quite wrong do not
+change a median, and errors that are too small by two only double it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.distance import mahalanobis
 
+from namod_ctl.core.errors import DataQualityError
 from namod_ctl.reconstruction.facet_fit import FacetFit, centre_covariance, response_scales, student_weight
 from namod_ctl.reconstruction.facet_psf import CENTRE, evaluate
 from namod_ctl.reconstruction.quality import has_signal, n_lit_records
 from namod_ctl.reconstruction.responses import ResponseTable
-from namod_ctl.reconstruction.robust import Family, fit_facets, fit_reflector
+from namod_ctl.reconstruction.robust import fit_reflector
+from namod_ctl.reconstruction.uncertainty import misfit_factors, repetition_factor
 
 Array = NDArray[np.float64]
 
@@ -34,6 +40,8 @@ _SIGNIFICANT_SIGMA, _SIGNIFICANT_SHARE = 3.0, 0.02
 _MIN_LIT_MOVED = 10  # lit records in each run: with fewer, centres are ambiguous rather than uncertain
 _MOVED_SIGMA = 5.0  # what a facet's model lacks may look like less
 _MOVED_SIZES = 0.5  # of a facet's width: sag and temperature move facets by less
+_OTHER_SIGMA = 4.0  # two runs of one mirror come to 1 and, with errors too small by two, to 2.4
+_MIN_COMPARED = 5  # facets, or all of a small telescope: a median of fewer may be one of wrong centres
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,14 +53,21 @@ class RunComparison:
     factor, factor_uncertainty
         Responses of the run over those of the reference; NaN when the two have too little light in common.
     n_compared
-        Facets lit often enough in both runs to see whether they moved.
+        Facets whose centre is known from either run.
+    distance_rad
+        Median of how far those stand from where they stand in the reference; NaN without any.
+    is_other_mirror
+        True when that cannot be chance: it is another telescope, or most facets were turned. None when too few could
+        be compared.
     moved_facet_ids
-        Those whose centre is not where it is in the reference.
+        Facets lit often enough in both runs whose centre is not where it is in the reference.
     """
 
     factor: float
     factor_uncertainty: float
     n_compared: int
+    distance_rad: float
+    is_other_mirror: bool | None
     moved_facet_ids: tuple[int, ...]
 
     @property
@@ -95,15 +110,22 @@ def compare_runs(
     is_known = sigma < _UNKNOWN_SIGMA
     is_known[reference], sigma[reference] = True, 0.0
     factor = np.where(is_known, np.exp(log_factor), np.nan)
-    centres = [
-        _Centres(replace(run, response=run.response / np.exp(log)), family)
-        for run, log in zip(runs, np.where(is_known, log_factor, 0.0).tolist(), strict=True)
-    ]
+    centres = [_Centres(run, expected_size_rad) for run in runs]  # they do not depend on the factors
     size_rad = float(np.exp(family.log_size))
     comparisons = []
     for run in range(len(runs)):
-        n_compared, moved = centres[run].moved_from(centres[reference], size_rad)
-        comparisons.append(RunComparison(float(factor[run]), float(factor[run] * sigma[run]), n_compared, moved))
+        there = centres[reference]
+        distances_rad = centres[run].distances_rad(there)
+        comparisons.append(
+            RunComparison(
+                factor=float(factor[run]),
+                factor_uncertainty=float(factor[run] * sigma[run]),
+                n_compared=len(distances_rad),
+                distance_rad=float(np.median(distances_rad)) if len(distances_rad) else np.nan,
+                is_other_mirror=centres[run].is_other_mirror(there, size_rad),
+                moved_facet_ids=centres[run].moved_from(there, size_rad),
+            )
+        )
     return comparisons
 
 
@@ -162,26 +184,78 @@ def _step(
 
 
 class _Centres:
-    """Fits of the facets that one run alone shows well, by column."""
+    """Fits of the facets that one run alone shows, by column."""
 
-    def __init__(self, table: ResponseTable, family: Family) -> None:
-        self._facet_ids = table.facet_ids
-        self._fits = {
-            j: fit
-            for j, fit in enumerate(fit_facets(table, family, np.arange(len(table.facet_ids))))
-            if fit is not None
-            and n_lit_records(fit, table.response[:, j]) >= _MIN_LIT_MOVED
-            and has_signal(fit, table, j)
-        }
+    def __init__(self, table: ResponseTable, expected_size_rad: float) -> None:
+        self._table = table
+        self._fits: dict[int, FacetFit] = {}
+        try:
+            self._family, fits = fit_reflector(table, expected_size_rad)
+        except DataQualityError:  # too few records, or no light in them
+            return
+        factors = misfit_factors(fits)
+        for j, fit in enumerate(fits):
+            if fit is not None and has_signal(fit, table, j):
+                self._fits[j] = fit
+        self._covariances = {j: factors[j] * centre_covariance(fit) for j, fit in self._fits.items()}
 
-    def moved_from(self, reference: _Centres, size_rad: float) -> tuple[int, tuple[int, ...]]:
-        """How many facets can be compared, and the ids of those that stand elsewhere."""
-        common = sorted(self._fits.keys() & reference._fits.keys())
+    @cached_property
+    def _repetition(self) -> float:
+        """Dear, and needed only for runs that seem to differ."""
+        return repetition_factor(self._table, self._family)
+
+    def distances_rad(self, reference: _Centres) -> Array:
+        """How far each facet that both runs show stands from where it is in the other, shape (n,)."""
+        return np.array([np.linalg.norm(self._step(reference, j)) for j in self._common(reference)])
+
+    def is_other_mirror(self, reference: _Centres, size_rad: float) -> bool | None:
+        """See `RunComparison`."""
+        common = self._common(reference)
+        if len(common) < min(_MIN_COMPARED, len(self._table.facet_ids)):
+            return None
+        if np.median(self.distances_rad(reference)) <= _MOVED_SIZES * size_rad:
+            return False
+        return (
+            self._median_sigma(reference, 1.0, 1.0) > _OTHER_SIGMA
+            and self._median_sigma(reference, self._repetition, reference._repetition) > _OTHER_SIGMA
+        )
+
+    def moved_from(self, reference: _Centres, size_rad: float) -> tuple[int, ...]:
+        """Ids of the facets that stand elsewhere, of those that are lit often in either run."""
         moved = []
-        for j in common:
-            here, there = self._fits[j], reference._fits[j]
-            a, b = here.parameters[CENTRE], there.parameters[CENTRE]
-            inverse = np.linalg.inv(centre_covariance(here) + centre_covariance(there))
-            if np.linalg.norm(a - b) > _MOVED_SIZES * size_rad and mahalanobis(a, b, inverse) > _MOVED_SIGMA:
-                moved.append(self._facet_ids[j])
-        return len(common), tuple(moved)
+        for j in self._common(reference):
+            if min(self._n_lit(j), reference._n_lit(j)) < _MIN_LIT_MOVED:
+                continue
+            step = self._step(reference, j)
+            joint = self._covariances[j] + reference._covariances[j]
+            if np.linalg.norm(step) > _MOVED_SIZES * size_rad and _sigmas(step, joint) > _MOVED_SIGMA:
+                moved.append(self._table.facet_ids[j])
+        return tuple(moved)
+
+    def _median_sigma(self, reference: _Centres, factor: float, reference_factor: float) -> float:
+        return float(
+            np.median(
+                [
+                    _sigmas(
+                        self._step(reference, j),
+                        factor * self._covariances[j] + reference_factor * reference._covariances[j],
+                    )
+                    for j in self._common(reference)
+                ]
+            )
+        )
+
+    def _common(self, reference: _Centres) -> list[int]:
+        return sorted(self._fits.keys() & reference._fits.keys())
+
+    def _step(self, reference: _Centres, j: int) -> Array:
+        step: Array = self._fits[j].parameters[CENTRE] - reference._fits[j].parameters[CENTRE]
+        return step
+
+    def _n_lit(self, j: int) -> int:
+        return n_lit_records(self._fits[j], self._table.response[:, j])
+
+
+def _sigmas(step: Array, covariance: Array) -> float:
+    """Length of a step in units of its error."""
+    return float(np.sqrt(step @ np.linalg.solve(covariance, step)))

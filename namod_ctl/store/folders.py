@@ -9,11 +9,14 @@ from __future__ import annotations
 
 import secrets
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.store.database import DATABASE_NAME, store_errors
 from namod_ctl.store.frames import sync_folder
+
+_MOST_NAMED = 6
 
 
 def partial_folder(path: Path) -> Path:
@@ -24,6 +27,30 @@ def partial_folder(path: Path) -> Path:
 def is_run(path: Path) -> bool:
     """True for a folder that holds a run."""
     return (path / DATABASE_NAME).is_file()
+
+
+def named_near(path: Path, is_sought: Callable[[Path], bool]) -> str:
+    """What a person may have meant by `path`: folders in it or else beside it that are sought, as a sentence's end."""
+    for folder in (path, path.parent):
+        try:
+            found = sorted(entry for entry in folder.iterdir() if entry.name[0] != "." and is_sought(entry))
+        except OSError:
+            continue  # there is no such folder, or we may not look into it
+        if found:
+            more = f" and {len(found) - _MOST_NAMED} more" if len(found) > _MOST_NAMED else ""
+            return f"; there {'is' if len(found) == 1 else 'are'} {', '.join(map(str, found[:_MOST_NAMED]))}{more}"
+    return ""
+
+
+def require_run(path: Path) -> None:
+    """Raise ConfigError when there is no run at `path`."""
+    if is_run(path):
+        return
+    hint = "make one with 'namod-ctl record --out' or 'namod-ctl import'"
+    if is_run(partial_folder(path)):
+        hint = f"an unfinished import lies in {partial_folder(path)}: finish it with --resume"
+    near = named_near(path, is_run)
+    raise ConfigError(f"{path}: there is no run here ({DATABASE_NAME} is missing){near}; {hint}")
 
 
 def check_output(path: Path, *, force: bool) -> None:

@@ -11,6 +11,7 @@ facets is on the disk after 0.3 ms, one of 1000 facets after 2 ms; 1300 x 30 res
 from __future__ import annotations
 
 import json
+import os
 import re
 import sqlite3
 from collections.abc import Iterable, Iterator, Sequence
@@ -23,11 +24,11 @@ from numpy.typing import NDArray
 
 from namod_ctl import __version__
 from namod_ctl.core.clock import Clock
-from namod_ctl.core.errors import ConfigError, StoreError
+from namod_ctl.core.errors import StoreError
 from namod_ctl.core.flags import RejectReason
 from namod_ctl.core.records import Record
 from namod_ctl.store.database import DATABASE_NAME, connect_existing, connect_new, store_errors, transaction
-from namod_ctl.store.folders import check_output, discard, free_sibling, is_run, partial_folder, put_in_place
+from namod_ctl.store.folders import check_output, discard, free_sibling, put_in_place, require_run
 from namod_ctl.store.frames import Frame, decode_png, encode_png, read_verified, sync_folder, write_file_durably
 
 FRAMES_FOLDER = "frames"
@@ -47,6 +48,7 @@ class RunStore:
         self._connection = connection
         self._database = path / DATABASE_NAME
         with store_errors(self._database):
+            self._stat = self._database.stat()
             self._meta: dict[str, str] = dict(connection.execute("SELECT key, value FROM meta"))
             rows = connection.execute("SELECT facet_id FROM facets ORDER BY position").fetchall()
         self._facet_ids = tuple(int(row[0]) for row in rows)
@@ -111,11 +113,7 @@ class RunStore:
             It was written by a newer program, is damaged, or cannot be opened.
         """
         path = Path(path).resolve()
-        if not is_run(path):
-            hint = "make one with 'namod-ctl import'"
-            if is_run(partial_folder(path)):
-                hint = f"an unfinished import lies in {partial_folder(path)}: finish it with --resume"
-            raise ConfigError(f"{path}: there is no run here ({DATABASE_NAME} is missing); {hint}")
+        require_run(path)
         connection = connect_existing(path / DATABASE_NAME, read_only=read_only)
         try:
             run = cls(path, connection)
@@ -137,6 +135,27 @@ class RunStore:
         """Fold SQLite's log into the one file and let go of it."""
         with store_errors(self._database):
             self._connection.close()
+
+    def check_in_place(self) -> None:
+        """Nothing, while the run's file is still the one that was opened.
+
+        SQLite goes on writing into a file that was deleted or moved away, and nobody would ever read that.
+
+        Raises
+        ------
+        StoreError
+            It is gone (its cause is then ENOENT, which waiting mends when the folder is put back), or another is there.
+        """
+        remedy = "put its folder back, or end this program and record anew: what it records now is lost"
+        try:
+            now = self._database.stat()
+        except OSError as error:
+            raise StoreError(
+                f"{self.path}: THE RUN IS GONE ({error.strerror}): it was deleted or moved, or its disk was taken "
+                f"away; {remedy}"
+            ) from error
+        if not os.path.samestat(now, self._stat):
+            raise StoreError(f"{self.path}: THE RUN WAS REPLACED by another one; {remedy}")
 
     @property
     def facet_ids(self) -> tuple[int, ...]:
@@ -174,6 +193,7 @@ class RunStore:
 
     def set_note(self, key: str, text: str) -> None:
         """Note something about this run, in place of what stood under `key`."""
+        self.check_in_place()
         with store_errors(self._database):
             self._connection.execute("INSERT OR REPLACE INTO meta VALUES (?, ?)", (_NOTE + key, text))
         self._meta[_NOTE + key] = text
@@ -181,13 +201,14 @@ class RunStore:
     def append(self, records: Iterable[Record]) -> None:
         """Add records, all of them or none: when this returns they are on the disk.
 
-        Raises StoreError for an index that the run already has.
+        Raises StoreError for an index that the run already has, and when the run is not where it was opened.
         """
         records = list(records)
         n_facets = len(self._facet_ids)
         for record in records:
             if record.facet_intensity.shape != (n_facets,) or record.facet_saturated_share.shape != (n_facets,):
                 raise ValueError(f"record {record.index}: its arrays do not fit the run's {n_facets} facets")
+        self.check_in_place()
         with store_errors(self._database), transaction(self._connection):
             self._connection.executemany(
                 "INSERT INTO records VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", map(_record_row, records)
@@ -229,6 +250,7 @@ class RunStore:
         """Keep a frame that is a PNG file already, byte by byte."""
         if not _CAMERA_NAME.fullmatch(camera):
             raise ValueError(f"{camera!r} is no camera's name")
+        self.check_in_place()
         name = f"{record_index:06d}_{camera}.png"
         with store_errors(self.path):
             sha256 = write_file_durably(self.path / FRAMES_FOLDER / name, data)

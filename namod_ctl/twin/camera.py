@@ -28,7 +28,7 @@ class TwinCamera:
     Attributes
     ----------
     n_frames
-        Frames so far, with those that got lost; seeds the noise of the next.
+        Frames so far, with those that got lost; seeds the noise of the next, together with its time.
     """
 
     def __init__(
@@ -87,7 +87,8 @@ class TwinCamera:
         end_s = start_s + exposure_s
         latency_s = self._sensor.settings.latency_s
         self.n_frames += 1
-        rng = generator(self._seed, f"frames of the {self._role} camera", self.n_frames)
+        # with the time: another session counts its frames from 1 again, and must not repeat the noise of the first
+        rng = generator(self._seed, f"frame of the {self._role} camera at {start_s:.6f} s", self.n_frames)
         if self._happens("dropped_frame", end_s, rng) or latency_s > timeout_s:
             self._update(end_s + timeout_s)
             self._refuse_lost(end_s + timeout_s)

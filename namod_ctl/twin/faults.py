@@ -5,22 +5,31 @@ from __future__ import annotations
 import math
 from collections.abc import Container, Mapping
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from types import MappingProxyType
 
 from namod_ctl.core.drives import Leg
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.units import deg_to_rad
-from namod_ctl.twin.settings import FaultSpec
+from namod_ctl.twin.settings import FaultSpec, Limits
 
 Value = float | str
 
 
 @dataclass(frozen=True, slots=True)
 class FaultKind:
-    """What a fault does, for people, and its parameters with their defaults."""
+    """What a fault does, for people, and its parameters with their defaults.
+
+    `limits` are those of parameters whose limits differ from those of `LIMITS`.
+    """
 
     description: str
     defaults: Mapping[str, Value]
+    limits: Mapping[str, Limits] = field(default_factory=lambda: MappingProxyType({}))
+
+    def limits_of(self, key: str) -> Limits | None:
+        """Of a parameter that is a number; None for one that is a name."""
+        return None if isinstance(self.defaults[key], str) else self.limits.get(key) or LIMITS[key]
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +81,41 @@ NO_FACET = -1.0
 WHOM: Mapping[str, Value] = {"facet": EVERY_FACET, "leg": EVERY_LEG}
 PAIR: Mapping[str, Value] = {"facet": NO_FACET, "leg": 1.0, "other_facet": NO_FACET, "other_leg": 1.0}
 
+_ANY_DIRECTION = Limits(deg_to_rad(-10.0), deg_to_rad(10.0))
+_YES_OR_NO = Limits(0.0, 1.0)
+LIMITS: Mapping[str, Limits] = {
+    "share": Limits(0.0, 1.0),
+    "factor": Limits(0.0, 100.0),
+    "count": Limits(0.0, 1000.0),
+    "delay_s": Limits(0.0, 60.0),
+    "facet": Limits(-1.0, 1e6),
+    "other_facet": Limits(-1.0, 1e6),
+    "leg": Limits(0.0, 6.0),
+    "other_leg": Limits(0.0, 6.0),
+    "end": Limits(-1.0, 1.0),
+    "is_in_move": _YES_OR_NO,
+    "is_reported": _YES_OR_NO,
+    "period_s": Limits(1.0, 1e6),
+    "offset_x_rad": _ANY_DIRECTION,
+    "offset_y_rad": _ANY_DIRECTION,
+    "miss_rad": _ANY_DIRECTION,
+    "x_rad": _ANY_DIRECTION,
+    "y_rad": _ANY_DIRECTION,
+    "fainter_mag": Limits(-10.0, 20.0),
+    "magnitude": Limits(-15.0, 20.0),
+    "angle_rad": Limits(-math.tau, math.tau),
+    "speed_rad_per_s": Limits(0.0, deg_to_rad(90.0)),
+    "blink_s": Limits(0.01, 60.0),
+    "level_share": Limits(0.0, 10.0),
+    "gradient_share": Limits(0.0, 10.0),
+    "rise_s": Limits(10.0, 1e6),
+    "decay_s": Limits(1.0, 1e6),
+    "floor": Limits(0.0, 1.0),
+    "adu_per_s": Limits(0.0, 1e6),
+    "by_s": Limits(-1e7, 1e7),
+}
+"""Of the parameters of all faults, by name."""
+
 DRIVE_CATALOGUE: Mapping[str, FaultKind] = {
     "bit_errors": FaultKind("bits flip on a line, both ways: in a `share` of all bytes", {"bus": "", "share": 0.003}),
     "line_noise": FaultKind(
@@ -118,6 +162,7 @@ CATALOGUE: Mapping[str, FaultKind] = {
     "clouds": FaultKind(
         "clouds drift by: the light falls by up to `factor`, smoothly, over and over within `period_s`",
         {"factor": 30.0, "period_s": 60.0},
+        {"factor": Limits(1.0, 1e6)},
     ),
     "clouds_total": FaultKind("an opaque cloud: no light of any star", {}),
     "second_star": FaultKind(
@@ -155,7 +200,11 @@ CATALOGUE: Mapping[str, FaultKind] = {
         "frames arrive incomplete; is_reported = 0: the camera does not notice and delivers a torn image",
         {"camera": "both", "share": 1.0, "is_reported": 1.0},
     ),
-    "hot_pixels": FaultKind("more hot pixels", {"camera": "both", "count": 3000.0, "adu_per_s": 400.0}),
+    "hot_pixels": FaultKind(
+        "more hot pixels",
+        {"camera": "both", "count": 3000.0, "adu_per_s": 400.0},
+        {"count": Limits(0.0, 1e6)},
+    ),
     "telescope_jump": FaultKind(
         "the telescope jumps by this much and stays there until the fault ends",
         {"x_rad": deg_to_rad(0.15), "y_rad": deg_to_rad(-0.1)},
@@ -188,7 +237,7 @@ class FaultPlan:
             if key not in kind.defaults:
                 known = ", ".join(kind.defaults) or "none"
                 raise ConfigError(f"fault {spec.name!r} has no parameter {key!r}; its parameters: {known}")
-            _refuse_wrong_value(spec.name, key, value, kind.defaults[key])
+            _refuse_wrong_value(spec.name, key, value, kind)
         duration_s = math.inf if spec.duration_s is None else spec.duration_s
         if not (spec.start_s >= 0.0 and duration_s > 0.0):
             raise ConfigError(
@@ -223,13 +272,15 @@ class FaultPlan:
         return -sum(fault.value("by_s") for fault in self.active("clock_set_back", time_s))
 
 
-def _refuse_wrong_value(fault: str, key: str, value: Value, default: Value) -> None:
-    where = f"fault {fault!r}: {key} = {value!r}"
+def _refuse_wrong_value(fault: str, key: str, value: Value, kind: FaultKind) -> None:
+    where, limits = f"fault {fault!r}: {key} = {value!r}", kind.limits_of(key)
     if key == "bus":
         if not isinstance(value, str):
             raise ConfigError(f"{where}; it must be the name of a bus, or '' for all")
-    elif isinstance(default, str):
+    elif limits is None:
         if value not in ("star", "reflector", "both"):
             raise ConfigError(f"{where}; it must be 'star', 'reflector' or 'both'")
     elif isinstance(value, str) or not math.isfinite(value):
         raise ConfigError(f"{where}; it must be a finite number")
+    elif not limits.least <= value <= limits.most:
+        raise ConfigError(f"{where}; it must be from {limits.least:g} to {limits.most:g}")

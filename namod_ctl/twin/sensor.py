@@ -95,7 +95,9 @@ class Sensor:
 
     def _draw_hot(self, count: int, adu_per_s: float, number: int) -> tuple[NDArray[np.intp], Array]:
         rng = generator(self._seed, f"hot pixels of {self._name}", number)
-        index = rng.choice(self.camera.n_rows * self.camera.n_columns, size=count, replace=False, shuffle=False)
+        n_pixels = self.camera.n_rows * self.camera.n_columns
+        count = min(count, n_pixels)
+        index = rng.choice(n_pixels, size=count, replace=False, shuffle=False)
         return index.astype(np.intp), adu_per_s * np.exp(rng.standard_normal(count))
 
 

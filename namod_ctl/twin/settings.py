@@ -5,12 +5,25 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from namod_ctl.core.units import arcmin_to_rad, arcsec_to_rad, deg_to_rad, mm_to_m
 
 STRICT: dict[str, Any] = {"extra": "forbid", "allow_inf_nan": False}
 """How pydantic reads these settings from a file: unknown keys and numbers that are none are mistakes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """The least and the largest value of a setting for which the twin's physics makes sense."""
+
+    least: float
+    most: float
+
+
+ANGLE = Limits(0.0, deg_to_rad(5.0))
+"""Of surfaces and images: a telescope whose facets are further off throws no light into its camera."""
+SHARE = Limits(0.0, 1.0)
 
 FACT_APERTURE_RAD = mm_to_m(1.7) / 4.889
 """Radius of the reflector camera's lens as seen from the dish: 1.7 mm at FACT's 4.889 m."""
@@ -45,17 +58,17 @@ class ReflectorSettings:
 
     __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
 
-    misalignment_rad: float = arcmin_to_rad(4.0)
-    figure_blur_rad: float = deg_to_rad(0.008)
-    focal_length_spread: float = 0.003
-    roughness_rad: float = arcsec_to_rad(16.0)
-    roughness_spread: float = 0.2
-    reflectivity: float = 0.85
-    reflectivity_spread: float = 0.03
-    sag_rad: float = arcmin_to_rad(0.15)
-    sag_hysteresis_rad: float = deg_to_rad(2.0)
-    drift_rad_per_kelvin: float = arcmin_to_rad(0.02)
-    cooling_kelvin_per_hour: float = 0.5
+    misalignment_rad: Annotated[float, ANGLE] = arcmin_to_rad(4.0)
+    figure_blur_rad: Annotated[float, ANGLE] = deg_to_rad(0.008)
+    focal_length_spread: Annotated[float, Limits(0.0, 0.2)] = 0.003
+    roughness_rad: Annotated[float, ANGLE] = arcsec_to_rad(16.0)
+    roughness_spread: Annotated[float, SHARE] = 0.2
+    reflectivity: Annotated[float, Limits(0.01, 1.0)] = 0.85
+    reflectivity_spread: Annotated[float, Limits(0.0, 0.5)] = 0.03
+    sag_rad: Annotated[float, ANGLE] = arcmin_to_rad(0.15)
+    sag_hysteresis_rad: Annotated[float, Limits(0.0, deg_to_rad(90.0))] = deg_to_rad(2.0)
+    drift_rad_per_kelvin: Annotated[float, ANGLE] = arcmin_to_rad(0.02)
+    cooling_kelvin_per_hour: Annotated[float, Limits(-20.0, 20.0)] = 0.5
 
 
 PERFECT = ReflectorSettings(0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -86,11 +99,11 @@ class SkySettings:
 
     reference_star: str = "Vega"
     star_changes: tuple[tuple[float, str], ...] = ()
-    latitude_rad: float = deg_to_rad(28.76)
-    altitude_m: float = 2200.0
-    sidereal_time_rad: float = deg_to_rad(255.0)
-    extinction_mag: float = 0.12
-    scintillation: float = 1.0
+    latitude_rad: Annotated[float, Limits(deg_to_rad(-90.0), deg_to_rad(90.0))] = deg_to_rad(28.76)
+    altitude_m: Annotated[float, Limits(-500.0, 9000.0)] = 2200.0
+    sidereal_time_rad: Annotated[float, Limits(deg_to_rad(-360.0), deg_to_rad(720.0))] = deg_to_rad(255.0)
+    extinction_mag: Annotated[float, Limits(0.0, 5.0)] = 0.12
+    scintillation: Annotated[float, Limits(0.0, 100.0)] = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,12 +129,12 @@ class TelescopeSettings:
     __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
 
     pattern: Literal["spiral", "random", "raster"] = "spiral"
-    radius_rad: float = deg_to_rad(0.35)
-    centre_rad: tuple[float, float] = (0.0, 0.0)
-    spacing_rad: float = arcmin_to_rad(1.0)
-    speed_rad_per_s: float = arcmin_to_rad(1.0)
-    jitter_rad: float = arcmin_to_rad(0.03)
-    slew_s: float = 10.0
+    radius_rad: Annotated[float, Limits(arcmin_to_rad(0.1), deg_to_rad(5.0))] = deg_to_rad(0.35)
+    centre_rad: Annotated[tuple[float, float], Limits(deg_to_rad(-5.0), deg_to_rad(5.0))] = (0.0, 0.0)
+    spacing_rad: Annotated[float, Limits(arcsec_to_rad(1.0), deg_to_rad(5.0))] = arcmin_to_rad(1.0)
+    speed_rad_per_s: Annotated[float, Limits(arcsec_to_rad(0.01), deg_to_rad(5.0))] = arcmin_to_rad(1.0)
+    jitter_rad: Annotated[float, Limits(0.0, deg_to_rad(1.0))] = arcmin_to_rad(0.03)
+    slew_s: Annotated[float, Limits(0.0, 3600.0)] = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,17 +158,17 @@ class CameraSettings:
 
     __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
 
-    exposure_at_mag0_s: float
-    background_share: float
-    read_noise_adu: float = 0.6
-    electrons_per_adu: float = 40.0
-    black_level_adu: float = 0.0
-    n_hot_pixels: int = 60
-    blooming_share: float = 0.1
-    exposure_range_s: tuple[float, float] = (0.001, 3.0)
-    exposure_step_s: float = 5e-5
-    latency_s: float = 0.015
-    law_error_per_decade: float = 0.0
+    exposure_at_mag0_s: Annotated[float, Limits(1e-5, 100.0)]
+    background_share: Annotated[float, SHARE]
+    read_noise_adu: Annotated[float, Limits(0.0, 100.0)] = 0.6
+    electrons_per_adu: Annotated[float, Limits(0.01, 1e6)] = 40.0
+    black_level_adu: Annotated[float, Limits(0.0, 1e4)] = 0.0
+    n_hot_pixels: Annotated[int, Limits(0, 1_000_000)] = 60
+    blooming_share: Annotated[float, SHARE] = 0.1
+    exposure_range_s: Annotated[tuple[float, float], Limits(1e-5, 60.0)] = (0.001, 3.0)
+    exposure_step_s: Annotated[float, Limits(1e-7, 0.1)] = 5e-5
+    latency_s: Annotated[float, Limits(0.0, 1.0)] = 0.015
+    law_error_per_decade: Annotated[float, Limits(-0.5, 5.0)] = 0.0
 
 
 # A dark sky has 21.5 magnitudes per square arcsec: 17 in a pixel of the star camera, of which a star's brightest holds
@@ -171,8 +184,8 @@ class FaultSpec:
     __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
 
     name: str
-    start_s: float = 0.0
-    duration_s: float | None = None
+    start_s: Annotated[float, Limits(0.0, 1e7)] = 0.0
+    duration_s: Annotated[float | None, Limits(1e-3, 1e7)] = None
     params: Mapping[str, float | str] = field(default_factory=lambda: MappingProxyType({}))
 
 
@@ -193,5 +206,5 @@ class TwinSettings:
     telescope: TelescopeSettings = TelescopeSettings()
     star_camera: CameraSettings = STAR_CAMERA
     reflector_camera: CameraSettings = REFLECTOR_CAMERA
-    aperture_radius_m: float | None = None
+    aperture_radius_m: Annotated[float | None, Limits(mm_to_m(0.01), 1.0)] = None
     faults: tuple[FaultSpec, ...] = ()

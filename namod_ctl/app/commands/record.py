@@ -25,20 +25,26 @@ from namod_ctl.app.twin_note import different_sections, note_twin, noted_twin
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.flags import REJECT_REASON_MEANING
+from namod_ctl.core.records import Record
 from namod_ctl.core.units import arcmin_to_rad, deg_to_rad
 from namod_ctl.cycle.live_estimate import LiveEstimator
 from namod_ctl.cycle.progress import Progress
 from namod_ctl.cycle.record import SESSION_GAP_S, Equipment, Recorder, StopRule
 from namod_ctl.cycle.replay import CAMERAS, ReplayCamera, ReplayClock, replayable_records
 from namod_ctl.optics.instrument import Instrument
+from namod_ctl.store.folders import check_output, discard, free_sibling, put_in_place
 from namod_ctl.store.import_namod import KeepFrames
 from namod_ctl.store.run import RunStore
+from namod_ctl.store.run_lock import recording_lock
 from namod_ctl.twin.settings import TwinSettings
 
 DEFAULT_N_RECORDS = 1300  # of FACT's night (arXiv:1605.06274, section 4)
 EXIT_INTERRUPTED = 130  # what shells report for a program that was ended by Ctrl-C
 DEFAULT_SEED = 1
 
+MAX_MINUTES = 24.0 * 60.0  # no night is longer
+MAX_EVERY_S = 3600.0
+MAX_REGION_RADIUS_DEG = 5.0
 _ANGLE = re.compile(r"([0-9]*\.?[0-9]+)\s*(arcmin|deg)")
 
 
@@ -50,8 +56,9 @@ class _Session:
     instrument: Instrument
     config: InstrumentConfig
     store: RunStore
+    path: Path
     pass_s: float
-    replayed: Iterator[tuple[int, str]] | None = None
+    replayed: Iterator[Record] | None = None
 
 
 def record(
@@ -82,7 +89,7 @@ def record(
         ),
     ] = None,
     region_radius_deg: Annotated[
-        float, typer.Option(min=0.01, max=5.0, help="Of the directions that are to be covered.")
+        float, typer.Option(min=0.01, max=MAX_REGION_RADIUS_DEG, help="Of the directions that are to be covered.")
     ] = 0.35,
     twin: Annotated[
         bool, typer.Option("--twin", help="Record the digital twin, in its own time, as fast as the computer can.")
@@ -104,13 +111,16 @@ def record(
 
     Example: namod-ctl record --twin --twin-settings config/twin/rough_night.toml --out RUN --records 300
     """
+    _refuse_beyond("--minutes", minutes, MAX_MINUTES)
+    _refuse_beyond("--every", every, MAX_EVERY_S)
+    _refuse_beyond("--region-radius-deg", region_radius_deg, MAX_REGION_RADIUS_DEG)
     stop = _stop_rule(records, minutes, until_uncertainty, is_replay=replay is not None)
     console = Console(stderr=True, highlight=False)
     with ExitStack() as stack:
         if replay is not None:
             if twin or any(option is not None for option in (append, config, seed, every, twin_settings)):
                 raise ConfigError("--replay takes everything from its run: give it --out and nothing else of the night")
-            session = _replay(stack, replay, out, force=force)
+            session = _replay(stack, replay, out, console, force=force)
             title = f"replay of {replay}"
         else:
             session = _record_twin(stack, out, append, config, seed, twin_settings, force=force)
@@ -130,14 +140,15 @@ def record(
         )
         estimator = None
         if replay is None:
-            estimator = LiveEstimator(session.store.path, session.instrument)
+            estimator = LiveEstimator(session.store.path, session.instrument, is_waited_for=True)  # a twin can
             stack.callback(estimator.close)
         recorder = Recorder(session.equipment, session.instrument, session.store, settings, estimator, session.replayed)
         with TerminalView(console, title) as view, _stopped_by_ctrl_c(recorder, console):
             reason = recorder.record(stop, view.show)
             progress = recorder.progress()
             view.show(progress, now=True)
-        _print_summary(session.store.path, reason, progress, recorder.events)
+        session.store.check_in_place()
+        _print_summary(session.path, reason, progress, recorder.events)
 
 
 def _stop_rule(records: int | None, minutes: float | None, until: str | None, *, is_replay: bool) -> StopRule:
@@ -148,6 +159,11 @@ def _stop_rule(records: int | None, minutes: float | None, until: str | None, *,
         duration_s=None if minutes is None else 60.0 * minutes,
         uncertainty_rad=None if until is None else _angle_rad(until),
     )
+
+
+def _refuse_beyond(option: str, value: float | None, limit: float) -> None:
+    if value is not None and not value <= limit:  # NaN as well
+        raise ConfigError(f"{option} {value:g}: must be at most {limit:g}")
 
 
 def _angle_rad(text: str) -> float:
@@ -169,9 +185,12 @@ def _record_twin(
 ) -> _Session:
     if (out is None) == (append is None):
         raise ConfigError("say where the records go: --out for a new run, or --append RUN to go on with one")
+    if append is not None and force:
+        raise ConfigError(f"--append {append}: goes on with that run, --force would replace one; leave one of them out")
     asked = None if settings_file is None else load_twin_settings(settings_file)
     if append is not None:
         store = stack.enter_context(RunStore.open(append, read_only=False))
+        stack.enter_context(recording_lock(store.path))
         noted = noted_twin(store)
         if noted is None:
             raise ConfigError(f"{append}: was not recorded with the twin, so the twin cannot go on with it; use --out")
@@ -203,26 +222,43 @@ def _record_twin(
             source += f", settings {settings_file.name}"
         facet_ids = [facet.id for facet in used.facets]
         store = stack.enter_context(RunStore.create(out, facet_ids, used.to_json(), source, twin.wall_clock, force))
+        stack.enter_context(recording_lock(store.path))
         note_twin(store, settings, chosen)
     equipment = Equipment(twin.star_camera, twin.reflector_camera, twin.clock, twin.wall_clock)
-    return _Session(equipment, twin.instrument, used, store, twin.telescope.pass_s)
+    return _Session(equipment, twin.instrument, used, store, store.path, twin.telescope.pass_s)
 
 
-def _replay(stack: ExitStack, replay: Path, out: Path | None, *, force: bool) -> _Session:
+def _replay(stack: ExitStack, replay: Path, out: Path | None, console: Console, *, force: bool) -> _Session:
     if out is None:
         raise ConfigError("--replay RUN needs --out for the new run: the old one stays as it is")
     if out.resolve() == replay.resolve():
         raise ConfigError(f"--out {out}: is the run that is replayed, which stays as it is; choose another")
     with RunStore.open(replay) as old:
         found = replayable_records(old)
+        n_without = len(old.labels()) - len(found)
+        if n_without:
+            text = f"{replay}: {n_without} of its records without frames left out"
+            console.print(text, markup=False, soft_wrap=True)
         star, reflector = (ReplayCamera(old, found, camera) for camera in CAMERAS)
         config = InstrumentConfig.from_json(old.config_json, f"{replay}: config")
         instrument = with_facet_map(build_instrument(config))
-        store = RunStore.create(out, old.facet_ids, old.config_json, f"replay of {old.path}", SystemClock(), force)
-    stack.enter_context(store)
-    identities = iter([(record.index, record.label) for record in found])
+    store = stack.enter_context(_put_at(out.resolve(), old, force=force))
     equipment = Equipment(star, reflector, ReplayClock(), SystemClock())
-    return _Session(equipment, instrument, config, store, 0.0, identities)
+    return _Session(equipment, instrument, config, store, out.resolve(), 0.0, iter(found))
+
+
+@contextmanager
+def _put_at(out: Path, old: RunStore, *, force: bool) -> Iterator[RunStore]:
+    """A run that is put at `out` when the block is done: a replay that fails leaves nothing and replaces nothing."""
+    check_output(out, force=force)
+    built = free_sibling(out)
+    try:
+        with RunStore.create(built, old.facet_ids, old.config_json, f"replay of {old.path}", SystemClock()) as store:
+            yield store
+        put_in_place(built, out, force=force)
+    except BaseException:
+        discard(built)
+        raise
 
 
 @contextmanager

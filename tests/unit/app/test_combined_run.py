@@ -18,11 +18,12 @@ from namod_ctl.app.build import build_instrument
 from namod_ctl.app.build_twin import build_twin, with_facet_map
 from namod_ctl.app.cli import main
 from namod_ctl.app.config import InstrumentConfig, load_config
+from namod_ctl.app.twin_note import note_twin
 from namod_ctl.core.records import Record
 from namod_ctl.core.units import arcmin_to_rad, deg_to_rad
 from namod_ctl.cycle.record import Equipment, Recorder, RecordSettings, StopRule
 from namod_ctl.store.run import RunStore
-from namod_ctl.twin.settings import SkySettings, TwinSettings
+from namod_ctl.twin.settings import PERFECT, SkySettings, TwinSettings
 
 FACET_IDS = (2, 3, 4, 5, 12, 13, 15, 16)  # of FACT's 30
 N_RECORDS = 400
@@ -249,3 +250,21 @@ def test_two_nights_of_the_twin(tmp_path: Path, namod_ctl: Call) -> None:
     assert np.all(np.diff(times_s) > 0.0)
     assert namod_ctl("instruct", tmp_path / "BOTH")[0] == 0
     assert (tmp_path / "BOTH" / "instructions.csv").is_file()
+
+
+@pytest.mark.parametrize("what", ["seed", "reflector"])
+def test_twins_of_two_mirrors_are_refused(tmp_path: Path, namod_ctl: Call, what: str) -> None:
+    """Whatever their records say: the runs know which twin they are of."""
+    records = made_records()
+    paths = [store_run(tmp_path / "FIRST", records[:200], 1), store_run(tmp_path / "SECOND", records[200:], 2)]
+    other = TwinSettings() if what == "seed" else TwinSettings(reflector=PERFECT)
+    for path, settings, seed in zip(paths, (TwinSettings(), other), (9, 10 if what == "seed" else 9), strict=True):
+        with RunStore.open(path, read_only=False) as store:
+            note_twin(store, settings, seed)
+    code, _, errors = namod_ctl("reconstruct", *paths, "--out", tmp_path / "BOTH")
+    assert code == 2
+    assert ("seed 10" if what == "seed" else "misalignment_rad = 0.0") in errors
+    assert not (tmp_path / "BOTH").exists()
+    with RunStore.open(paths[1], read_only=False) as store:
+        note_twin(store, TwinSettings(), 9)
+    assert namod_ctl("reconstruct", *paths, "--out", tmp_path / "BOTH")[0] == 0

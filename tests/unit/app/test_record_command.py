@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+import sqlite3
 from pathlib import Path
 
 import pytest
@@ -15,6 +17,7 @@ from namod_ctl.app.twin_note import noted_twin
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.errors import NamodError, StoreError
 from namod_ctl.store.run import RunStore
+from namod_ctl.store.run_lock import recording_lock
 from namod_ctl.twin.settings import TwinSettings
 
 app = typer.Typer()
@@ -147,3 +150,57 @@ def test_a_replayed_twin_is_the_same_run(twin_run: Path, tmp_path: Path) -> None
 def test_a_telescope_without_a_map_of_facets_can_be_recorded(tmp_path: Path) -> None:
     code, output = call("--out", tmp_path / "RUN", "--config", "mini_fact", "--records", 2, "--every", 0)
     assert code == 0, output
+
+
+@pytest.mark.parametrize("option", ["--minutes", "--every", "--region-radius-deg"])
+@pytest.mark.parametrize("value", ["inf", "nan", "1e12"])
+def test_numbers_without_sense_are_refused(tmp_path: Path, option: str, value: str) -> None:
+    code, output = call("--out", tmp_path / "NEW", option, value)
+    assert code == 2
+    assert option in output
+    assert not (tmp_path / "NEW").exists()
+
+
+def test_append_and_force_contradict_each_other(twin_run: Path) -> None:
+    code, output = call("--append", twin_run, "--force", "--records", 9)
+    assert code == 2
+    assert "--force" in output
+
+
+def test_a_run_that_is_not_there_can_be_recorded(tmp_path: Path) -> None:
+    code, output = call("--append", tmp_path / "NOPE", "--records", 9)
+    assert code == 2
+    assert "record --out" in output
+
+
+def test_two_recorders_do_not_share_a_run(twin_run: Path) -> None:
+    with recording_lock(twin_run):
+        code, output = call("--append", twin_run, "--records", 9)
+    assert code == 2
+    assert "another program" in output
+
+
+def copied(run: Path, to: Path) -> Path:
+    return Path(shutil.copytree(run, to))
+
+
+def test_a_replay_says_which_records_it_leaves_out(twin_run: Path, tmp_path: Path) -> None:
+    run = copied(twin_run, tmp_path / "COPY")
+    with sqlite3.connect(run / "run.sqlite") as connection:
+        connection.execute("DELETE FROM frames WHERE record_index = 1")
+    connection.close()
+    code, output = call("--replay", run, "--out", tmp_path / "AGAIN")
+    assert code == 0
+    assert "1 of its records without frames left out" in output
+
+
+def test_a_replay_that_fails_leaves_nothing_and_replaces_nothing(twin_run: Path, tmp_path: Path) -> None:
+    run, old = copied(twin_run, tmp_path / "COPY"), copied(twin_run, tmp_path / "OLD")
+    (run / "frames" / "000002_star_camera.png").write_bytes(b"torn")
+    code, output = call("--replay", run, "--out", tmp_path / "AGAIN")
+    assert code == 2
+    assert "000002_star_camera" in output
+    assert call("--replay", run, "--out", old, "--force")[0] == 2
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["COPY", "OLD"]
+    with RunStore.open(old) as kept:
+        assert "twin" in kept.source

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from dataclasses import replace
+from io import StringIO
 
 import numpy as np
 import pytest
+from rich.console import Console
 
-from namod_ctl.app.terminal import coverage_lines, plain_line, star_brightness, steering
+from namod_ctl.app.terminal import TerminalView, coverage_lines, plain_line, star_brightness, steering
 from namod_ctl.core.flags import RejectReason
 from namod_ctl.core.records import Record
 from namod_ctl.cycle.coverage import N_CELLS, empty_coverage, with_record
@@ -66,7 +68,7 @@ def test_silence_is_named() -> None:
 
 
 def test_the_rate_is_that_of_the_last_minute() -> None:
-    every_second = deque((float(second), None) for second in range(301))
+    every_second: deque[tuple[float, RejectReason | None]] = deque((float(second), None) for second in range(301))
     assert rate_per_min(every_second, 0.0, 300.0) == pytest.approx(60.0)
     assert rate_per_min(every_second, 0.0, 330.0) == pytest.approx(30.0)
     assert rate_per_min(deque([(9.0, None)]), 0.0, 10.0) == pytest.approx(6.0)  # younger than a minute
@@ -134,3 +136,45 @@ def test_a_plain_line_holds_the_numbers_and_the_warning() -> None:
     assert "+0.00 mag relative" in line
     assert "+-0.50 arcmin (facet 12; 2 facets not seen; 7 records)" in line
     assert line.endswith("look up")
+
+
+@pytest.mark.parametrize("pace_s", [35.0, 40.0])
+def test_a_slow_pace_is_no_trouble_and_neither_is_one_rejected_record(pace_s: float) -> None:
+    tracker = Tracker(RADIUS, 0.0, pace_s=pace_s)
+    now_s, reasons = 0.0, [None, None, RejectReason.REFLECTOR_SATURATED, None, None]
+    for reason in reasons:
+        now_s += pace_s
+        assert told_at(tracker, now_s - 0.1).warning == ""
+        tracker.add(record(reason), now_s, ALL_WELL)
+        assert told_at(tracker, now_s).warning == ""
+    for _ in range(5):
+        now_s += pace_s
+        tracker.add(record(RejectReason.STAR_AT_EDGE), now_s, ALL_WELL)
+    assert "middle of the star camera's field" in told_at(tracker, now_s).warning
+
+
+def test_one_is_no_plural() -> None:
+    assert "(1 record)" in warning_text(31.0, Counter({RejectReason.NO_STAR: 1}), Counter())
+    assert "(once)" in warning_text(31.0, Counter(), Counter({DropCause.NO_FRAME: 1}))
+
+
+def test_what_stops_the_recording_hides_what_else_is_wrong_and_is_news() -> None:
+    """A disk that is full for a minute is no matter of the cameras' cables."""
+    tracker = Tracker(RADIUS, 0.0)
+    tracker.add(record(), 1.0, ALL_WELL)
+    cameras = SourceStatus({DropCause.CAMERA_LOST: 9}, 0, "no answer")
+    before, after = tracker.snapshot(90.0, cameras, None), tracker.snapshot(100.0, cameras, None)
+    halted = tracker.snapshot(95.0, cameras, None, "the disk is full")
+    assert "cable" in plain_line(before)
+    assert plain_line(halted).endswith("the disk is full")
+    text = StringIO()
+    view = TerminalView(Console(file=text, force_terminal=False, width=200), "night")
+    for progress in (before, before, halted, halted, after, after):
+        view.show(progress)
+    assert text.getvalue().count("the disk is full") == 1
+    assert text.getvalue().count("cable") == 2
+    screen = StringIO()
+    with TerminalView(Console(file=screen, force_terminal=True, width=120), "night") as live:
+        live.show(halted)
+    assert "the disk is full" in screen.getvalue()
+    assert "cable" not in screen.getvalue()

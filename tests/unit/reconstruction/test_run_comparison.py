@@ -67,6 +67,33 @@ def test_facets_that_were_turned_in_between_are_named() -> None:
     found = compared(before.with_response(response), run_of_record)
     assert found.n_compared >= 8
     assert found.moved_facet_ids == (3, 7)
+    assert found.is_other_mirror is False  # ten of twelve stand where they stood
+
+
+def sparse_pair(seed: int, other: int, n_each: int = 150) -> RunComparison:
+    """Two runs so sparse that a facet is lit a few times only; of one mirror where the seeds of the mirrors agree."""
+    centres = [np.random.default_rng(mirror).normal(0, 4 * ARCMIN, (12, 2)) for mirror in (seed, other)]
+    path = make_run(seed, 2 * n_each, centres_rad=centres[0])
+    second = make_run(seed, 2 * n_each, centres_rad=centres[1])
+    run_of_record = np.repeat([0, 1], n_each)
+    response = np.where(run_of_record[:, None] == 1, second.table.response, path.table.response)
+    return compared(path.with_response(response), run_of_record)
+
+
+@pytest.mark.parametrize("seed", [31, 32])
+def test_sparse_runs_of_one_mirror_combine_and_of_two_do_not(seed: int) -> None:
+    same, other = sparse_pair(seed, seed), sparse_pair(seed, seed + 100)
+    assert same.is_other_mirror is False
+    assert other.is_other_mirror is True
+    # the distance of two normal deviates of 4 arcmin in two axes: a median of 4 sqrt(2) 1.18 = 6.7 arcmin
+    assert 4 * ARCMIN < other.distance_rad < 10 * ARCMIN
+    assert same.distance_rad < 1 * ARCMIN
+
+
+def test_runs_with_too_little_light_in_common_are_not_judged() -> None:
+    made, run_of_record = two_runs(17, 1.0)
+    response = np.where(run_of_record[:, None] == 1, 3e-4, made.table.response)
+    assert compared(made.with_response(response), run_of_record).is_other_mirror is None
 
 
 def narrow_disc(rng: np.random.Generator, n: int) -> np.ndarray:

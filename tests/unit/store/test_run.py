@@ -16,6 +16,7 @@ from namod_ctl.core.flags import RejectReason
 from namod_ctl.core.records import Record
 from namod_ctl.store import database
 from namod_ctl.store.run import RunStore
+from namod_ctl.store.run_lock import recording_lock
 
 FACET_IDS = (12, 3, 40)
 CONFIG = json.dumps({"telescope": {"name": "TEST"}, "more": [1.5, "ä"]})
@@ -306,3 +307,44 @@ def test_a_second_writer_waits_and_then_complains(path: Path, run: RunStore, mon
         other.execute("ROLLBACK")
         writer.append([make_record(0)])
     other.close()
+
+
+def test_a_run_that_was_moved_away_takes_nothing_until_it_is_back(path: Path, run: RunStore) -> None:
+    """SQLite itself goes on writing into a file that no path leads to."""
+    away = path.with_name("AWAY")
+    with run:
+        run.append([make_record(0)])
+        path.rename(away)
+        with pytest.raises(StoreError, match="GONE") as refused:
+            run.append([make_record(1)])
+        assert isinstance(refused.value.__cause__, FileNotFoundError)
+        for write in (run.check_in_place, lambda: run.set_note("a", "b")):
+            with pytest.raises(StoreError, match="GONE"):
+                write()
+        away.rename(path)
+        run.append([make_record(1)])
+    with RunStore.open(path) as reopened:
+        assert len(reopened.records()) == 2
+
+
+def test_a_run_in_whose_place_another_stands_takes_nothing(path: Path, run: RunStore) -> None:
+    with run:
+        RunStore.create(path, FACET_IDS, CONFIG, "another", ManualClock(), force=True).close()
+        with pytest.raises(StoreError, match="REPLACED"):
+            run.append([make_record(1)])
+        with pytest.raises(StoreError, match="REPLACED"):
+            run.add_frame(1, "star_camera", np.zeros((4, 4), dtype=np.uint8))
+    with RunStore.open(path) as other:
+        assert other.source == "another"
+        assert other.records() == []
+    assert not list((path / "frames").iterdir())
+
+
+def test_one_program_at_a_time_records_into_a_run(path: Path, run: RunStore) -> None:
+    run.close()
+    with recording_lock(path):
+        with pytest.raises(ConfigError, match="another program"), recording_lock(path):
+            pass
+        RunStore.open(path).close()  # reading is free
+    with recording_lock(path):
+        pass

@@ -115,3 +115,15 @@ def test_a_lost_camera_fails_until_it_is_back() -> None:
     twin.star_camera.fetch(1.0)
     twin.update(1.3)
     assert pair(twin)[1].any()
+
+
+def test_another_session_does_not_repeat_the_noise_of_the_first() -> None:
+    """Frames are counted from 1 again in each session, and the star stands still."""
+    first, again, later = small_twin(), small_twin(), small_twin()
+    later.update(500.0)
+    frames = [pair(twin) for twin in (first, again, later)]
+    for n in (0, 1):
+        assert np.array_equal(frames[0][n], frames[1][n])
+        same = np.mean(frames[0][n] == frames[2][n])
+        different = np.mean(frames[0][n] == pair(first)[n])
+        assert same == pytest.approx(different, abs=0.05)

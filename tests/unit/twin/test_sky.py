@@ -99,3 +99,17 @@ def test_a_satellite_crosses_the_field_once() -> None:
 def test_jupiter_is_a_disc() -> None:
     jupiter = sky(SkySettings(reference_star="Jupiter"))
     assert jupiter.tracks(0.0, 0.01, STEP_RAD, 10)[0].diameter_rad == pytest.approx(deg_to_rad(42.0 / 3600.0))
+
+
+def test_planets_hardly_scintillate() -> None:
+    """Behind a lens of 37 mm Jupiter's 42 arcsec, 2 m wide at 10 km, count: (2 m / 37 mm)^(2/3) = 14 times less."""
+    highest = {
+        name: SkySettings(reference_star=name, latitude_rad=star.declination_rad, sidereal_time_rad=right_ascension)
+        for name, star in CATALOGUE.items()
+        if (right_ascension := star.right_ascension_rad) and name in ("Vega", "Jupiter")
+    }
+    sigma = {}
+    for name, settings in highest.items():
+        rng = np.random.default_rng(1)
+        sigma[name] = np.std([sky(settings).scintillation(0.0, 0.01, 0.037, rng) for _ in range(1000)])
+    assert sigma["Vega"] / sigma["Jupiter"] == pytest.approx((2.04 / 0.037) ** (2 / 3), rel=0.1)
