@@ -2,9 +2,9 @@
 
 Run: python benchmarks/bench_align.py [--seeds 1001,1002,...] [--configs fact_actuated,...] [--records 400]
 
-Every seed is another telescope: other misalignments, mirrors, motors' zeros, paths over the sky. Real protocol bytes on
-real lines (see the configs). Beside it the paper's figure for one correction of the real FACT by hand: 2.60 times the limit
-(arXiv:1605.06274).
+Every seed is another telescope: other misalignments, mirrors, motors' zeros, paths over the sky. Real protocol bytes
+on real lines (see the configs). Beside it the paper's figure for one correction of the real FACT by hand: 2.60 times
+the limit (arXiv:1605.06274).
 """
 
 from __future__ import annotations

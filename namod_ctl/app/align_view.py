@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import select
 import sys
+from collections.abc import Sequence
 from types import TracebackType
-from typing import Self
+from typing import Literal, Self
 
 from rich.console import Console
 from rich.markup import escape
@@ -31,8 +32,7 @@ class AlignView(View):
         self._console = console
         self._live: TerminalView | None = None
         self._state = ""
-        self._question = ""
-        self._answers: list[bool] = []
+        self._is_asked = False
 
     def __enter__(self) -> Self:
         return self
@@ -84,20 +84,37 @@ class AlignView(View):
 
     def answer(self) -> bool | None:
         """What the person at this terminal types: yes or no, and Enter."""
-        if not sys.stdin.isatty():
-            return None
-        if not self._question:
-            self._question = "carry it out? [y/n] (or `namod-ctl approve` elsewhere) "
-            self._console.print(self._question, end="", markup=False)
-        ready, _, _ = select.select([sys.stdin], [], [], 0.0)
-        if not ready:
-            return None
-        self._question = ""
-        return sys.stdin.readline().strip().lower() in ("y", "yes")
+        text = self._typed("carry it out? [y/n] (or `namod-ctl approve` elsewhere) ")
+        return None if text is None else text.lower() in ("y", "yes")
+
+    def turned(self) -> Sequence[int] | Literal["all"]:
+        """What the person at this terminal types: ids of facets with commas between, or all, and Enter."""
+        text = self._typed("which facets are turned? [13,31 or all] (or `namod-ctl done` elsewhere) ")
+        if not text:
+            return ()
+        if text.lower() == "all":
+            return "all"
+        words = [word.strip() for word in text.split(",")]
+        if all(word.isascii() and word.isdigit() for word in words):
+            return [int(word) for word in words]
+        self._line(f"{text!r}: type ids of facets with commas between, such as 13,31, or all")
+        return ()
 
     def wait(self) -> None:
         """Until somebody types, or a moment is over in which requests of other terminals may have come."""
         select.select([sys.stdin] if sys.stdin.isatty() else [], [], [], WAIT_S)
+
+    def _typed(self, question: str) -> str | None:
+        """The line that was typed since the question was put, which it is once; None as long as there is none."""
+        if not sys.stdin.isatty():
+            return None
+        if not self._is_asked:
+            self._is_asked = True
+            self._console.print(question, end="", markup=False)
+        if not select.select([sys.stdin], [], [], 0.0)[0]:
+            return None
+        self._is_asked = False
+        return sys.stdin.readline().strip()
 
     def _line(self, text: str) -> None:
         self._end_live()

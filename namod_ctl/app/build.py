@@ -27,4 +27,5 @@ def build_instrument(config: InstrumentConfig) -> Instrument:
         },
         goniometer_resolution_rad=deg_to_rad(mount.goniometer_resolution_deg),
         star_size_rad=deg_to_rad(config.star_camera.star_diameter_deg),
+        bolts_seen_from=mount.bolts_seen_from,
     )

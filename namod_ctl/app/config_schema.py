@@ -109,6 +109,7 @@ class _MountSection(Section):
     goniometer_resolution_deg: Annotated[float, within(0.05, 90.0)]
     backlash_um: Annotated[float, within(0.0, 2000.0)]
     facet_orientation_deg: dict[str, AngleDeg] = Field(default_factory=dict)
+    bolts_seen_from: Literal["front", "back"] = "back"  # changes drawings only: no number depends on it
 
 
 class TripodMountSection(_MountSection):

@@ -99,6 +99,8 @@ def _mount_rows(config: InstrumentConfig, instrument: Instrument) -> tuple[tuple
     if section.pitch_mm_per_turn is not None:
         rows.append(("bolts", f"{section.pitch_mm_per_turn:g} mm per turn"))
         rows.append(("sense of turning", f"{section.turn_raises_leg}, as seen by who turns, moves a leg to the sky"))
+        side = "behind the mirror" if section.bolts_seen_from == "back" else "in front of the mirror"
+        rows.append(("turned from", f"{side}; sheets are drawn as seen from there"))
         rows.append(("goniometer", f"{section.goniometer_resolution_deg:g} deg"))
     else:
         rows.append(("bolts", "none: legs without a pitch, driven by actuators"))

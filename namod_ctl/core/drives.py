@@ -166,6 +166,13 @@ class Bus(Protocol):
         """What answers on the line at any address that the config names, one line each, for a person."""
         ...
 
+    def hurry(self, is_hurried: bool) -> None:
+        """Give every question one short attempt from now on, the one under way included; or as many as usual again.
+
+        For orders to stop: they must reach all drives, whoever answers. Safe from any thread.
+        """
+        ...
+
     def close(self) -> None:
         """Let go of the line."""
         ...

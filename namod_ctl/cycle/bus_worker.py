@@ -1,5 +1,8 @@
 """One bus's share of a motion: rounds over its drives, what silence means, and stopping them.
 
+A stop begins in a hurry (`Bus.hurry`): orders go out to all legs that may move, each with one short wait for its
+answer. Who has not confirmed by then is told again with patience.
+
 All methods with exchanges run in the thread of the bus, one after the other; nothing here waits.
 """
 
@@ -25,6 +28,10 @@ N_SILENT = 3
 """After so many unanswered questions in a row one suspects the bus rather than the drives,"""
 BLINK_S = 0.25
 """if it has been silent for longer than this."""
+ROUND_S = 2.0
+"""So long at most a bus goes on by itself, before the caller's thread has to send it on another round."""
+N_HURRIED = 3
+"""So often legs are told to stop in a hurry, until they confirm it."""
 
 Answer = TypeVar("Answer")
 
@@ -108,38 +115,61 @@ class BusWorker:
         return has_waiting and len(self._active) < self.bus.max_moving
 
     def move(self) -> None:
-        """A round over the legs that move, and as many new ones as may move with them."""
+        """A round: passes over the legs, as long as time passes meanwhile and everybody answers."""
         self._unchecked.clear()  # homing begins without
-        for course in self._active:
+        began_s = pass_s = self._clock.monotonic_s()
+        while True:
+            has_answered = self._pass(began_s + ROUND_S)
+            now_s = self._clock.monotonic_s()
+            is_round_over = not pass_s < now_s < began_s + ROUND_S
+            if is_round_over or not has_answered or self._switch.is_thrown or not self.is_due(now_s):
+                break
+            pass_s = now_s
+        if self._n_silent >= N_SILENT and not self._switch.is_thrown:
+            self._suspect_bus()
+
+    def _pass(self, until_s: float) -> bool:
+        """Once over the legs that move, and as many new ones as may move with them; not beyond `until_s`.
+
+        Returns
+        -------
+        bool
+            Everybody has answered.
+        """
+        has_answered = True
+        for course in tuple(self._active):
             if course.due_s <= self._clock.monotonic_s():
-                self._visit(course)
-                if self._switch.is_thrown:
-                    return
+                has_answered &= self._visit(course)
+                self._active.remove(course)
+                self._active.append(course)  # a pass that ends early begins with others the next time
+                if self._switch.is_thrown or self._clock.monotonic_s() >= until_s:
+                    break
         self._active = [course for course in self._active if course.outcome is None]
-        while self._waiting and self._may_begin_another():
+        while self._waiting and self._may_begin_another() and self._clock.monotonic_s() < until_s:
             course = self._waiting.popleft()
             if course.outcome is not None:
                 continue
-            self._visit(course)
+            has_answered &= self._visit(course)
             if course.outcome is None:
                 self._active.append(course)
             if self._n_silent >= N_SILENT:
                 break
-        if self._n_silent >= N_SILENT:
-            self._suspect_bus()
+        return has_answered
 
     def _may_begin_another(self) -> bool:
         is_bus_well = self._bus_lost_since_s is None
         return is_bus_well and len(self._active) < self.bus.max_moving and not self._switch.is_thrown
 
-    def _visit(self, course: Course) -> None:
+    def _visit(self, course: Course) -> bool:
+        """Has the drive answered, or need not be asked?"""
         broken = self.broken_facets.get(course.leg.facet_id)
         if broken is not None and not course.may_move:
             course.finish(MoveOutcome.REFUSED, broken)
-            return
-        self._exchange(course, lambda: course.visit(self._clock, lambda: not self._switch.is_thrown))
+            return True
+        has_answered = self._exchange(course, lambda: course.visit(self._clock, lambda: not self._switch.is_thrown))
         if course.outcome not in (None, MoveOutcome.ARRIVED):
             self.broken_facets.setdefault(course.leg.facet_id, broken_text(course))
+        return has_answered
 
     def _exchange(self, course: Course, exchange: Callable[[], None]) -> bool:
         """Has the drive answered?"""
@@ -201,6 +231,21 @@ class BusWorker:
     def is_stopped(self) -> bool:
         """Has every drive taken its stop, and is every leg that was moved seen to stand?"""
         return self._to_stop is not None and not self._to_stop and self.is_done
+
+    def stop_in_a_hurry(self, everybody: bool) -> None:
+        """Orders to stop to all legs that may move, or to `everybody`, whoever is silent; then the hurry is over."""
+        to_stop = self._to_stop = deque(self._stop_order())
+        urgent = list(to_stop) if everybody else self._movers()
+        self.bus.hurry(True)
+        try:
+            for _ in range(N_HURRIED):
+                for leg in urgent:
+                    with suppress(CommunicationError, DeviceFaultError):  # it stays among those to stop
+                        self.drives[leg].stop()
+                        to_stop.remove(leg)
+                urgent = [leg for leg in urgent if leg in to_stop]
+        finally:
+            self.bus.hurry(False)
 
     def stop(self) -> None:
         """A round of stops to all drives that have not taken theirs, and a look at the legs that were moved."""
@@ -268,10 +313,14 @@ class BusWorker:
 
     def _stop_order(self) -> list[Leg]:
         """Those that move and answer, those that move and are silent, all others."""
+        return list(dict.fromkeys([*self._movers(), *self.drives]))
+
+    def _movers(self) -> list[Leg]:
+        """Legs with orders that may move, those that answer first."""
         moving = [course.leg for course in self.courses if course.may_move and course.outcome is None]
         lost = [course.leg for course in self.courses if course.outcome is MoveOutcome.LOST]
         first = sorted(moving, key=lambda leg: leg in self._silent_since_s)
-        return list(dict.fromkeys([*first, *lost, *self.drives]))
+        return [*first, *lost]
 
     # --- reading
 

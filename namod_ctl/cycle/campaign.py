@@ -83,6 +83,9 @@ class Campaign:
         """
         try:
             self._corrector.recover(self._poll)
+            self._learn_again()
+            if self.state == "awaiting_operator":
+                self._remind()
             while self.state not in FINAL:
                 state = self.state
                 self._view.state(state, "")
@@ -125,7 +128,8 @@ class Campaign:
                     else:
                         self._refuse(request)
 
-            reason = recorder.record(StopRule(n_records=self._settings.n_records), on_progress)
+            wanted = self._settings.n_records * (1 + self._n_poor)  # once more as many where they did not suffice
+            reason = recorder.record(StopRule(n_records=wanted), on_progress)
             n_accepted = recorder.progress().n_accepted
         self._store.save_cycle(replace(cycle, n_records=n_accepted))
         if self.state == "recording":
@@ -145,12 +149,8 @@ class Campaign:
         try:
             result = self._reconstructed(cycle)
         except DataQualityError as error:
-            self._n_poor += 1
-            if self._n_poor > MAX_POOR_RECORDINGS:
-                raise
-            self._machine.fire("poor_data", str(error))
+            self._record_again(str(error))
             return
-        self._n_poor = 0
         for finding in self._corrector.learn(self._alignments()):
             self._tell("finding", finding)
         plan = self._corrector.plan(result)
@@ -163,7 +163,11 @@ class Campaign:
             alignment_json=self._outside.alignment_to_json(result.alignment),
         )
         self._note_forecast(cycle.number, plan)
-        decision, why = decide(self._history(cycle), self._settings.limit_rad2, self._settings.max_cycles)
+        decision, why = decide(self._history(cycle, plan), self._settings.limit_rad2, self._settings.max_cycles)
+        if decision is Decision.VAGUE:
+            self._record_again(why)
+            return
+        self._n_poor = 0
         self._store.save_cycle(replace(cycle, decision=f"{decision.value}: {why}"))
         self._view.measured(self._store.cycles()[-1], result)
         match decision:
@@ -173,6 +177,9 @@ class Campaign:
                 self._after_worse(why)
             case Decision.TOO_MANY:
                 raise SafetyStop(why)
+            case Decision.STUCK:
+                kept = [f"facet {number}: {text}" for number, text in plan.refused.items()]
+                raise SafetyStop("; ".join([why, *kept]))
             case Decision.CORRECT:
                 self._machine.fire("correct", why)
 
@@ -184,7 +191,7 @@ class Campaign:
             data = {"cycle": number, "facet_id": facet_id, "leg": None, "why": why}
             self._store.add_event("refused", f"facet {facet_id}: {why}", data)
         self._view.plan(self._plan)
-        if not self._plan.turned:
+        if not self._plan.turned and not self._plan.tried:
             raise SafetyStop(f"no facet can be turned: {next(iter(self._plan.refused.values()), 'there are none')}")
         if self._corrector.are_people:
             self._machine.fire("instruct", f"{len(self._plan.turned)} facets to turn by hand")
@@ -194,8 +201,8 @@ class Campaign:
             self._machine.fire("approve", "approved beforehand")
 
     def _in_awaiting_approval(self) -> None:
-        if self._plan is None:  # after a restart: what was shown then may not hold any more
-            self._in_previewing_again()
+        if self._plan is None:
+            self._machine.fire("changed", "restarted while a person was asked: it is worked out and shown again")
             return
         answer = self._view.answer()
         for request in self._requests():
@@ -248,9 +255,14 @@ class Campaign:
     def _in_awaiting_operator(self) -> None:
         for request in self._requests():
             if request.kind is RequestKind.DONE:
-                self._control.answer(request, self._corrector.mark_done(request.facet_ids))
+                answer = self._corrector.mark_done(request.facet_ids)
+                self._control.answer(request, answer)
+                self._view.told(answer)
             else:
                 self._refuse(request)
+        marked = self._view.turned()
+        if marked:
+            self._view.told(self._corrector.mark_done(marked))
         if self._corrector.is_done():
             self._plan = None
             self._machine.fire("done", "all facets are marked as done")
@@ -259,14 +271,37 @@ class Campaign:
 
     # -- helpers ----------------------------------------------------------------------------------------------------
 
-    def _in_previewing_again(self) -> None:
-        raise SafetyStop("restarted while a person was asked: release, and look at the preview again")
+    def _remind(self) -> None:
+        """People who turn bolts: where their sheets are, and what is left."""
+        for event in [event for event in self._store.events() if event.kind == "instructions"][-1:]:
+            self._view.told(event.text)
+        self._view.told(self._corrector.mark_done(()))
+
+    def _learn_again(self) -> None:
+        """After a restart: what the corrections so far have taught, in the two last steps of before.
+
+        Without it a plan would be made with the config's wiring, where the program knew better already.
+        """
+        known = self._known_alignments()
+        if self.state == "reconstructing":  # the last cycle is learned from there
+            known.pop(self._store.cycles()[-1].number, None)
+        for n_known in range(max(len(known) - 1, 1), len(known) + 1):
+            self._corrector.learn(dict(sorted(known.items())[:n_known]))
+
+    def _record_again(self, why: str) -> None:
+        """Once more as many records in the same cycle, a bounded number of times. Raises DataQualityError."""
+        self._n_poor += 1
+        if self._n_poor > MAX_POOR_RECORDINGS:
+            raise DataQualityError(f"{why}; it stayed so in {self._n_poor} recordings")
+        self._machine.fire("poor_data", why)
 
     def _after_worse(self, why: str) -> None:
-        n_undone = sum(event.kind == "undone" for event in self._store.events())
+        if self._corrector.are_people and self._corrector.has_learned:
+            self._machine.fire("correct", f"{why}; new sheets go from where the facets are now")
+            return
+        n_undone = sum(event.data.get("trigger") == "undo" for event in self._store.events())
         if n_undone or not self._corrector.can_undo:
             raise SafetyStop(f"{why}; {'it was undone once already' if n_undone else 'people must look'}")
-        self._tell("undone", why)
         self._machine.fire("undo", why)
 
     def _cycle_to_record(self) -> Cycle:
@@ -297,19 +332,21 @@ class Campaign:
 
     def _alignments(self) -> dict[int, Alignment]:
         """Alignments of all cycles that have one, the present one included, by number."""
-        last = self._store.cycles()[-1].number
-        found = {
+        assert self._result is not None
+        return self._known_alignments() | {self._store.cycles()[-1].number: self._result.alignment}
+
+    def _known_alignments(self) -> dict[int, Alignment]:
+        """Alignments that are on record, by number of their cycle."""
+        return {
             cycle.number: self._outside.alignment_from_json(cycle.alignment_json, f"cycle {cycle.number}")
             for cycle in self._store.cycles()
             if cycle.alignment_json is not None
         }
-        assert self._result is not None
-        return found | {last: self._result.alignment}
 
     def _note_forecast(self, number: int, plan: Plan) -> None:
         self._store.set_note(f"{NOTE_FORECASTS}.{number}", repr(plan.forecast.uncertainty_rad2))
 
-    def _history(self, last: Cycle) -> list[Measurement]:
+    def _history(self, last: Cycle, plan: Plan) -> list[Measurement]:
         """Measurements since the campaign began, or since the last correction that was taken back."""
         measured = [cycle for cycle in self._store.cycles() if cycle.number < last.number] + [last]
         undone_in = {
@@ -324,6 +361,8 @@ class Campaign:
                 continue
             doubt = float(self._store.note(f"{NOTE_FORECASTS}.{cycle.number}") or "nan")
             history.append(Measurement.of(cycle, doubt))
+        if history:
+            history[-1] = replace(history[-1], possible=plan.possible, is_trying=bool(plan.tried))
         return history
 
     def _requests(self) -> list[Request]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from namod_ctl.cycle.plan import Plan
 from namod_ctl.cycle.progress import Progress
@@ -58,6 +59,10 @@ class View:
     def answer(self) -> bool | None:
         """Whether the person at the terminal approves of the plan shown last; None: no answer yet."""
         return None
+
+    def turned(self) -> Sequence[int] | Literal["all"]:
+        """Facets that the person at the terminal says are turned as asked; empty: no answer yet."""
+        return ()
 
     def wait(self) -> None:
         """Wait a moment for a person, or for a request from elsewhere."""

@@ -20,6 +20,12 @@ WORTH_SHARE = 0.03
 
 WORSE_SIGMAS = 3.0
 
+VAGUE_SHARE = 0.15
+"""Of the area: a measurement more uncertain than that (a facet may be lost from sight) proves nothing converged."""
+
+KEPT_SHARE = 0.25
+"""Of the area: where facets that may not be turned keep so much from being won, a person must look at them."""
+
 
 class Decision(StrEnum):
     """What a campaign does after a measurement."""
@@ -27,6 +33,8 @@ class Decision(StrEnum):
     CORRECT = "correct"
     CONVERGED = "converged"
     WORSE = "worse"
+    VAGUE = "vague"
+    STUCK = "stuck"
     TOO_MANY = "too_many"
 
 
@@ -40,10 +48,16 @@ class Measurement:
         As it was measured.
     forecast
         As the correction that follows from this measurement would leave it.
+    possible
+        As it would be left if every facet could be turned; None when nobody has worked it out.
+    is_trying
+        Facets are tried whose faults are not understood yet.
     """
 
     now: AreaOfPsf
     forecast: AreaOfPsf
+    possible: AreaOfPsf | None = None
+    is_trying: bool = False
 
     @classmethod
     def of(cls, cycle: Cycle, forecast_uncertainty_rad2: float) -> Self:
@@ -57,9 +71,28 @@ class Measurement:
 def decide(history: Sequence[Measurement], limit_rad2: float | None, max_cycles: int) -> tuple[Decision, str]:
     """The decision after the last of the measurements, and why, for a person.
 
+    Nothing has converged that was hardly measured, nor while facets that may not be turned keep much from being won.
+
     `limit_rad2` is the area of these facets perfectly aligned where it is known, by ray tracing of measured
     mirrors; that of mirrors without errors is no such limit, as real ones never reach it.
     """
+    decision, why = _decide(history, limit_rad2, max_cycles)
+    last = history[-1]
+    area = last.now.a_sigma_rad2
+    if decision is not Decision.CONVERGED:
+        return decision, why
+    if last.now.uncertainty_rad2 > VAGUE_SHARE * area:
+        return Decision.VAGUE, f"{_area(last.now)} is too uncertain to tell whether it has converged"
+    kept = 0.0 if last.possible is None else last.forecast.a_sigma_rad2 - last.possible.a_sigma_rad2
+    text = f"{_area(last.now)}: facets that may not be turned keep it from {_area(last.possible or last.now)}"
+    if kept <= KEPT_SHARE * area:
+        return decision, why
+    if last.is_trying and len(history) <= max_cycles:
+        return Decision.CORRECT, f"{text}; small moves will tell what is wrong with them"
+    return Decision.STUCK, text
+
+
+def _decide(history: Sequence[Measurement], limit_rad2: float | None, max_cycles: int) -> tuple[Decision, str]:
     last = history[-1]
     area, doubt = last.now.a_sigma_rad2, last.now.uncertainty_rad2
     text = _area(last.now)

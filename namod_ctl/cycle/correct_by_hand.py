@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
@@ -19,6 +21,8 @@ from namod_ctl.reconstruction.alignment import Alignment, FacetAlignment
 from namod_ctl.reconstruction.reconstruct import Reconstruction, turning_cov_rad2
 from namod_ctl.store.campaign import CampaignStore
 
+_NOTE_TOLD = "marks_told"
+
 
 class ManualCorrector:
     """Asks people to turn bolts. See `correct.Corrector`.
@@ -35,7 +39,6 @@ class ManualCorrector:
 
     are_people = True
     can_undo = False
-    has_learned = False
 
     def __init__(
         self,
@@ -49,16 +52,20 @@ class ManualCorrector:
         self._write_sheets, self._goniometer_sigma_rad = write_sheets, goniometer_sigma_rad
         self._on_done = on_done
         self._result: Reconstruction | None = None
+        self.has_learned = False
+        """Did the last call of `learn` find slips of people, which the next sheets make good?"""
 
     def check(self) -> list[str]:
         """People are there or not; nobody can be asked."""
         return []
 
     def recover(self, poll: Callable[[], None]) -> None:
-        """Turns asked for are on record; there is nothing to read back."""
+        """Turns asked for are on record; facets may have been marked while the program did not run."""
+        self._tell_of_marks()
 
     def learn(self, alignments: Mapping[int, Alignment]) -> list[str]:
         """Facet by facet, whether the turns that were asked for are what was done."""
+        self.has_learned = False
         if len(alignments) < 2:
             return []
         before, after = (alignments[number] for number in sorted(alignments)[-2:])
@@ -70,9 +77,17 @@ class ManualCorrector:
             for alignment in (before, after)
         )
         findings = check_turns(self._instrument.mounts, asked, was, is_now, self._goniometer_sigma_rad)
-        n_right = sum(finding.kind is TurnKind.RIGHT for finding in findings)
-        summary = f"{n_right} of {len(asked)} facets were turned as asked"
-        return [summary, *(finding.sentence for finding in findings if finding.kind.is_mistake)]
+        kinds = Counter(finding.kind for finding in findings if finding.facet_id in asked)
+        mistakes = [finding for finding in findings if finding.kind.is_mistake]
+        # where nearly all are turned the other way it is no slip: the config or the sheets are read wrongly
+        self.has_learned = bool(mistakes) and kinds[TurnKind.WRONG_DIRECTION] <= len(asked) / 2
+        summary = f"{kinds[TurnKind.RIGHT]} of {len(asked)} facets were turned as asked"
+        if kinds[TurnKind.TOO_SMALL]:
+            summary += f"; at {kinds[TurnKind.TOO_SMALL]} the turns asked for were too small to tell"
+        n_unseen = len(asked) - kinds.total()
+        if n_unseen:
+            summary += f"; {n_unseen} were not seen before or after"
+        return [summary, *(finding.sentence for finding in mistakes)]
 
     def plan(self, result: Reconstruction) -> Plan:
         """Facets that people are to turn; their turns follow in `instruct`."""
@@ -115,9 +130,7 @@ class ManualCorrector:
             newly = self._store.mark_done(None if facet_ids == "all" else [int(facet_id) for facet_id in facet_ids])
         except ConfigError as error:
             return str(error)
-        asked = {turns.facet_id: turns.turns_deg for turns in self._store.turns()}
-        for facet_id in newly:
-            self._on_done(facet_id, asked[facet_id])
+        self._tell_of_marks()
         left = [turns.facet_id for turns in self._store.turns() if not turns.is_done]
         rest = "all are done" if not left else f"{len(left)} to go: {', '.join(map(str, left))}"
         return f"{len(newly)} facets marked; {rest}"
@@ -128,6 +141,18 @@ class ManualCorrector:
 
     def stop(self, reason: str) -> None:
         """Nothing moves by itself."""
+
+    def _tell_of_marks(self) -> None:
+        """Tell `on_done` of marked facets, of each at most once: a kill in between must not turn a bolt twice."""
+        marked = [turns for turns in self._store.turns() if turns.is_done]
+        if not marked:
+            return
+        key = f"{_NOTE_TOLD}.{marked[0].cycle}"
+        told = set(json.loads(self._store.note(key) or "[]"))
+        self._store.set_note(key, json.dumps(sorted(told | {turns.facet_id for turns in marked})))
+        for turns in marked:
+            if turns.facet_id not in told:
+                self._on_done(turns.facet_id, turns.turns_deg)
 
     def _turning_cov_rad2(self, facet_id: int) -> NDArray[np.float64]:
         return turning_cov_rad2(self._instrument.mounts[facet_id], self._instrument.goniometer_resolution_rad)

@@ -27,6 +27,7 @@ from namod_ctl.store.campaign import CampaignStore
 from namod_ctl.store.campaign_rows import JournaledOrder
 
 _N_SHOWN = 5
+_N_ASKED_AGAIN = 3
 
 
 class MotorCorrector:
@@ -107,7 +108,7 @@ class MotorCorrector:
 
     def plan(self, result: Reconstruction) -> Plan:
         """The correction, from where the drives stand now."""
-        states = self._mover.read_states()
+        states = self._read_patiently()
         failed = self._failed_facets()
         trials = {facet_id: travels for facet_id, travels in self._learned.trials().items() if facet_id not in failed}
         return plan_correction(
@@ -122,7 +123,7 @@ class MotorCorrector:
 
     def changed_since(self, plan: Plan) -> str:
         """Drives that stand elsewhere than when the plan was made."""
-        states = self._mover.read_states([order.leg for order in plan.orders])
+        states = self._read_patiently([order.leg for order in plan.orders])
         for order in plan.orders:
             state = states[order.leg]
             trouble = _trouble(state)
@@ -168,6 +169,15 @@ class MotorCorrector:
             self._mover.stop_all(reason)
         except (NamodError, OSError):
             return  # every drive that could be reached was told; the reason for the stop matters more
+
+    def _read_patiently(self, legs: Sequence[Leg] | None = None) -> dict[Leg, DriveState | str]:
+        """States of drives, None: all; one that does not answer is asked again before its facet is left out for it."""
+        states = self._mover.read_states(legs)
+        for _ in range(_N_ASKED_AGAIN):
+            silent = [leg for leg, state in states.items() if isinstance(state, str)]
+            if silent:
+                states |= self._mover.read_states(silent)
+        return states
 
     def _execute(self, cycle: int, orders: Sequence[MoveOrder], poll: Callable[[], None]) -> str:
         ids = dict(zip((order.leg for order in orders), self._store.order(cycle, orders), strict=True))

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from namod_ctl.core.drives import Leg
+from namod_ctl.cycle.common_gain import common_gain
 from namod_ctl.cycle.evidence import Observation
-from namod_ctl.cycle.learn import FaultKind, diagnose
+from namod_ctl.cycle.learn import FaultKind, diagnose, observed
 from namod_ctl.cycle.remedy import Remedy, remedy_of
 from namod_ctl.optics.mounts import Mount
 from namod_ctl.reconstruction.alignment import Alignment, FacetAlignment
+
+_NEWS_SHARE = 0.05
+"""A common gain that changes by less is known better, but no news."""
 
 
 class LearnedWiring:
@@ -21,6 +26,7 @@ class LearnedWiring:
         self._mounts, self._resolution_m = mounts, resolution_m
         self._remedy = Remedy(mounts, {}, {}, {})
         self._known: dict[int, FaultKind] = {}
+        self._gain = 1.0
         self.has_news = False
         """Did the last call of `learn` find a fault that the one before had not?"""
 
@@ -42,24 +48,46 @@ class LearnedWiring:
         observations = observations_of(self._mounts, travels_m, alignments)
         if not observations:
             return []
+        gain = common_gain(observed(self._mounts, observations, self._resolution_m))
+        observations = [_scaled(observation, gain) for observation in observations]
         findings = diagnose(self._mounts, observations, resolution_m=self._resolution_m)
         self._remedy = remedy_of(self._mounts, observations, findings, resolution_m=self._resolution_m)
         faults = [finding for finding in findings if finding.kind.is_fault]
-        news = [finding for finding in faults if self._known.get(finding.facet_id) != finding.kind]
+        news = [finding.sentence for finding in faults if self._known.get(finding.facet_id) != finding.kind]
+        if abs(gain - self._gain) > _NEWS_SHARE * abs(gain):
+            news.insert(0, _in_words(gain))
+            self._gain = gain
         self._known = {finding.facet_id: finding.kind for finding in faults}
         self.has_news = bool(news)
-        return [finding.sentence for finding in news]
+        return news
 
     def travels(self, facet: FacetAlignment) -> Mapping[Leg, float]:
         """Travel, m, of every drive that turns the facet as it needs; none for a facet that must not be corrected."""
-        return self._remedy.travel_for(facet.facet_id, facet.tilt_correction_rad)
+        travels = self._remedy.travel_for(facet.facet_id, facet.tilt_correction_rad)
+        return {leg: travel / self._gain for leg, travel in travels.items()}
 
     def trials(self) -> dict[int, dict[Leg, float]]:
         """By facet that nobody understands yet: small travels, m, that will tell what is wrong with it."""
         return {
-            facet_id: {Leg(facet_id, k): float(travel) for k, travel in enumerate(travels)}
+            facet_id: {Leg(facet_id, k): float(travel) / self._gain for k, travel in enumerate(travels)}
             for facet_id, travels in self._remedy.trials_m.items()
         }
+
+
+def _scaled(observation: Observation, gain: float) -> Observation:
+    """The observation with travels as they really were."""
+    return replace(observation, travels_m={facet: gain * travel for facet, travel in observation.travels_m.items()})
+
+
+def _in_words(gain: float) -> str:
+    if gain == 1.0:
+        return "all legs move as the config says after all"
+    if gain == -1.0:
+        return "all legs move the wrong way: sign in the config's [actuators] is wrong; it is reckoned with from now on"
+    return (
+        f"all legs move by a factor {gain:.3g} of what was ordered: step_um in the config's [actuators] or the pitch "
+        "is wrong, or the supply is too weak for max_moving drives at once; it is reckoned with from now on"
+    )
 
 
 def observations_of(

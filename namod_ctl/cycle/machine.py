@@ -53,7 +53,7 @@ TRANSITIONS: tuple[Transition, ...] = (
     Transition("undo", ("reconstructing",), "undoing"),
     Transition("ask", ("previewing",), "awaiting_approval"),
     Transition("approve", ("previewing", "awaiting_approval"), "correcting"),
-    Transition("changed", ("correcting",), "previewing"),
+    Transition("changed", ("awaiting_approval", "correcting"), "previewing"),
     Transition("instruct", ("previewing",), "instructing"),
     Transition("wait", ("instructing",), "awaiting_operator"),
     Transition("done", ("awaiting_operator",), "recording"),

@@ -2,8 +2,9 @@
 
 Each bus has one thread. The caller's thread sends the buses on rounds and lets time pass between them: so the caller's
 thread alone waits, journals and notices what other terminals ask for, and on the twin all buses live in one time.
-When the switch is thrown, a round ends after the exchange that is on the line; every bus then stops its drives, those
-it set moving first, whatever the other buses are doing.
+When the switch is thrown, a round ends after the exchange that is on the line, and that is cut short; every bus then
+stops its drives, those it set moving first, whatever the other buses are doing. Drives hear their stops even where
+their answers are lost: so all of them are told, in a hurry, before anybody is asked again with patience.
 """
 
 from __future__ import annotations
@@ -160,7 +161,7 @@ class Mover:
         self._switch.throw(reason)
         with ExitStack() as stack:
             workers = self._workers(stack, [], {})
-            interrupt = self._halt(workers)
+            interrupt = self._halt(workers, everybody=True)
             futures = [worker.submit(worker.standings) for worker in workers]
             found = {leg: words for future in futures for leg, words in future.result().items()}
         if interrupt is not None:
@@ -231,16 +232,16 @@ class Mover:
     ) -> None:
         """Send all buses on rounds until all are over; return at once when the switch is thrown."""
         while not self._must_stop() and not all(is_over(worker) for worker in workers):
-            began_s = self._clock.monotonic_s()
-            rounds = [
-                worker.submit(partial(round_of, worker))
-                for worker in workers
-                if not is_over(worker) and worker.is_due(began_s)
-            ]
-            while not _all_done(rounds, LOOK_S):
+            began_s = sent_s = self._clock.monotonic_s()
+            rounds: dict[BusWorker, Future[None]] = {}
+            _send(workers, round_of, is_over, rounds, began_s)
+            while not _all_done(list(rounds.values()), LOOK_S):
                 look()
                 if self._must_stop():
                     return
+                now_s = self._clock.monotonic_s()
+                if now_s > sent_s:  # who was quick does not wait for who is slow
+                    _send(workers, round_of, is_over, rounds, sent_s := now_s)
             look()
             spent_s = self._clock.monotonic_s() - began_s
             if not self._must_stop():
@@ -249,9 +250,12 @@ class Mover:
     def _must_stop(self) -> bool:
         return self._switch.is_thrown
 
-    def _halt(self, workers: Sequence[BusWorker]) -> BaseException | None:
-        """Stop all drives on all buses. An interrupt meanwhile does not shorten it: it is returned, for later."""
-        interrupt: BaseException | None = None
+    def _halt(self, workers: Sequence[BusWorker], *, everybody: bool = False) -> BaseException | None:
+        """Stop all drives on all buses. An interrupt meanwhile does not shorten it: it is returned, for later.
+
+        Those with orders that may move are told first, in a hurry; `everybody` where nothing is known of orders.
+        """
+        interrupt = self._tell_in_a_hurry(workers, everybody)
         began_s = self._clock.monotonic_s()
         n_rounds = 0
         while n_rounds < N_STOP_ROUNDS or self._clock.monotonic_s() < began_s + STOP_S:
@@ -272,6 +276,21 @@ class Mover:
             worker.submit(worker.give_up_stopping).result()
         return interrupt
 
+    def _tell_in_a_hurry(self, workers: Sequence[BusWorker], everybody: bool) -> BaseException | None:
+        """Orders to stop to all legs that may move, on all buses at once. What was raised meanwhile is returned."""
+        interrupt: BaseException | None = None
+        rounds: list[Future[None]] = []
+        while True:
+            try:
+                for worker in workers[len(rounds) :]:
+                    worker.bus.hurry(True)  # now: the question under way is cut short
+                    rounds.append(worker.submit(partial(worker.stop_in_a_hurry, everybody)))
+                wait(rounds)
+                break
+            except (KeyboardInterrupt, SystemExit) as error:
+                interrupt = interrupt or error
+        return next((bug for each in rounds if (bug := each.exception()) is not None), interrupt)
+
     def _ask(self, legs: Sequence[Leg], question: Callable[[Drive], Answer]) -> dict[Leg, Answer]:
         """Ask all buses at once; an interrupt ends it after the exchanges that are under way."""
         is_over = False
@@ -290,6 +309,23 @@ class Mover:
                 is_over = True
             found = {leg: answer for future in futures for leg, answer in future.result().items()}
         return {leg: found[leg] for leg in legs}
+
+
+def _send(
+    workers: Sequence[BusWorker],
+    round_of: Callable[[BusWorker], None],
+    is_over: Callable[[BusWorker], bool],
+    rounds: dict[BusWorker, Future[None]],
+    now_s: float,
+) -> None:
+    """Send those on a round that are not on one and have something to do."""
+    for worker in workers:
+        if worker in rounds:
+            if not rounds[worker].done():
+                continue
+            rounds[worker].result()  # raises what the round raised
+        if not is_over(worker) and worker.is_due(now_s):
+            rounds[worker] = worker.submit(partial(round_of, worker))
 
 
 def _all_done(futures: Sequence[Future[Answer]], timeout_s: float) -> bool:

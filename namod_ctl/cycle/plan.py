@@ -40,12 +40,18 @@ class Plan:
         Facets that stay as they are, and why, for a person.
     forecast
         Area of the point spread function afterwards, from the facets' own measured light.
+    possible
+        The same if every facet that was seen could be turned.
+    tried
+        Facets that stay as they are, but for a small move that will tell what is wrong with them.
     """
 
     orders: tuple[MoveOrder, ...]
     turned: tuple[int, ...]
     refused: Mapping[int, str]
     forecast: AreaOfPsf
+    possible: AreaOfPsf | None = None
+    tried: tuple[int, ...] = ()
 
 
 def plan_correction(
@@ -66,7 +72,7 @@ def plan_correction(
     disabled
         Facets that must not be corrected, and why.
     trials
-        Small travels of disabled facets that will tell what is wrong with them; made only beside a correction.
+        Small travels of disabled facets that will tell what is wrong with them.
     """
     orders: list[MoveOrder] = []
     refused: dict[int, str] = {}
@@ -81,12 +87,15 @@ def plan_correction(
         turned.append(facet.facet_id)
         orders += _orders(travels, states, drives)
     taken = {order.leg for order in orders}
+    tried = []
     for facet_id, travels in trials.items():
         can_move = not _reason_of_drives(travels, states, drives, settings) and not taken.intersection(travels)
-        if turned and facet_id in disabled and can_move:
+        if facet_id in disabled and can_move:
+            tried.append(facet_id)
             refused[facet_id] += "; a small move tries what is wrong with it"
             orders += _orders(travels, states, drives)
-    return Plan(tuple(orders), tuple(turned), refused, forecast(result, turned))
+    possible = forecast(result, [facet.facet_id for facet in result.alignment.facets])
+    return Plan(tuple(orders), tuple(turned), refused, forecast(result, turned), possible, tuple(tried))
 
 
 def forecast(

@@ -7,11 +7,23 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import namod_ctl
 from firmware_protocols.modbus_drive import RegisterMap
 from firmware_protocols.modbus_map import RegisterMapError, read_register_map
 from namod_ctl.core.errors import ConfigError
 
-__all__ = ["RegisterMap", "drive_map_of", "read_drive_map"]
+__all__ = ["RegisterMap", "builtin_map_names", "drive_map_of", "load_register_map", "read_drive_map"]
+
+
+def builtin_map_names() -> list[str]:
+    """Names of the register maps that come with the program, such as `cia402`."""
+    return sorted(path.stem for path in _builtin_folder().glob("*.toml"))
+
+
+def load_register_map(path_or_builtin_name: str | Path) -> RegisterMap:
+    """The register map of a TOML file or a built-in name. Raises ConfigError as the functions below."""
+    name = str(path_or_builtin_name)
+    return drive_map_of(read_drive_map(name, Path(), _builtin_folder()), name)
 
 
 def read_drive_map(name: str, folder: Path, builtin_folder: Path) -> dict[str, Any]:
@@ -49,3 +61,10 @@ def drive_map_of(table: Mapping[str, Any], source: str) -> RegisterMap:
         return read_register_map(dict(table))
     except RegisterMapError as error:
         raise ConfigError("\n".join(f"{source}: {problem}" for problem in error.problems)) from None
+
+
+def _builtin_folder() -> Path:
+    """Inside the installed package, or beside it in a checkout."""
+    package = Path(namod_ctl.__file__).parent
+    inside = package / "config"
+    return (inside if inside.is_dir() else package.parent / "config") / "drives"

@@ -10,10 +10,14 @@ What makes a late answer harmless depends on the protocol:
 
 Sums of one byte miss some pairs of wrong bits. A refusal therefore counts when a drive has given it twice: every
 question may be asked again without harm.
+
+In a hurry (`Line.hurry`), when stops have to reach every drive, a question gets one short attempt and nobody is brought
+in step for it. An answer that may be another question's then counts as none; the order was heard all the same.
 """
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -25,6 +29,7 @@ from namod_ctl.core.drives import ByteTransport
 from namod_ctl.core.errors import CommunicationError
 
 _READ_SIZE = 4096
+_LOOK_S = 0.01  # so often a question that waits for its answer looks whether there is a hurry
 _N_SILENCES = 50  # so many silences' time at most is spent on waiting for one; a line that never is silent fails anyway
 
 TOKEN_VARIABLE = 255
@@ -79,8 +84,8 @@ class _Parser(Protocol[MessageOut]):
     def reset(self) -> int: ...
 
 
-class _AttemptError(Exception):
-    """One attempt came to nothing; seen inside of this module only."""
+class AttemptError(Exception):
+    """One attempt came to nothing; seen by links only."""
 
 
 class Line(Generic[Message]):
@@ -91,6 +96,7 @@ class Line(Generic[Message]):
         self._parser = parser
         self._settings = settings
         self._is_broken = False
+        self._hurried_timeout_s: float | None = None
         self.statistics = LinkStatistics()
 
     @property
@@ -102,24 +108,34 @@ class Line(Generic[Message]):
         """Let go of the line."""
         self._transport.close()
 
+    def hurry(self, timeout_s: float | None) -> None:
+        """Give questions one attempt of so long from now on, the one under way included; None: as set. Thread-safe."""
+        self._hurried_timeout_s = timeout_s
+
+    @property
+    def is_hurried(self) -> bool:
+        """Is there a hurry?"""
+        return self._hurried_timeout_s is not None
+
     def persist(self, who: str, attempt: Callable[[], Answer]) -> Answer:
-        """What `attempt` gives, tried a bounded number of times.
+        """What `attempt` gives, tried a bounded number of times; once in a hurry.
 
         Raises
         ------
         CommunicationError
             Every attempt failed; names `who`, the line, and what came.
         """
-        n_attempts = self._settings.n_retries + 1
+        n_attempts = 0
         problem = ""
-        for index in range(n_attempts):
+        while n_attempts == 0 or (n_attempts <= self._settings.n_retries and not self.is_hurried):
             self._mend(who)
+            n_attempts += 1
             try:
-                if index:
+                if n_attempts > 1:
                     self.statistics.n_retries += 1
                     self._wait_for_silence()
                 answer = attempt()
-            except _AttemptError as error:
+            except AttemptError as error:
                 problem = str(error)
             except CommunicationError as error:
                 self._is_broken = True
@@ -127,8 +143,9 @@ class Line(Generic[Message]):
             else:
                 self.statistics.n_exchanges += 1
                 return answer
+        tries = "one attempt" if n_attempts == 1 else f"{n_attempts} attempts"
         raise CommunicationError(
-            f"{who} on {self.name}: no usable answer in {n_attempts} attempts; the last: {problem}. "
+            f"{who} on {self.name}: no usable answer in {tries}; the last: {problem}. "
             "Check its power, its address and the cable"
         )
 
@@ -160,7 +177,7 @@ class Line(Generic[Message]):
 
         Raises
         ------
-        _AttemptError
+        AttemptError
             None in time, or damage without an answer behind it.
         CommunicationError
             The line is gone.
@@ -179,14 +196,18 @@ class Line(Generic[Message]):
         echo_left = question if self._settings.has_echo else b""
         heard = b""
         damage = ""
-        left_s = self._settings.timeout_s
-        deadline_s = time.monotonic() + left_s
-        while left_s > 0.0 and (data := self._transport.read(_READ_SIZE, left_s)):
+        waited_s = 0.0
+        began_s = time.monotonic()
+        deadline_s = math.inf
+        while (left_s := min(self._patience_s() - waited_s, deadline_s - time.monotonic())) > 0.0:
+            look_s = min(left_s, _LOOK_S)
+            data = self._transport.read(_READ_SIZE, look_s)
+            waited_s = max(waited_s + (0.0 if data else look_s), time.monotonic() - began_s)
             heard += data
-            if echo_left:
+            if echo_left and data:
                 n_echo = min(len(echo_left), len(data))
                 if data[:n_echo] != echo_left[:n_echo]:
-                    raise _AttemptError(f"another echo than what was sent: {heard[:40].hex(' ')}")
+                    raise AttemptError(f"another echo than what was sent: {heard[:40].hex(' ')}")
                 data, echo_left = data[n_echo:], echo_left[n_echo:]
             self._parser.receive_data(data)
             for message in self._messages():
@@ -196,9 +217,14 @@ class Line(Generic[Message]):
                     deadline_s = min(deadline_s, time.monotonic() + self._settings.silence_s)
                 elif (answer := answer_in(message)) is not None:
                     return answer
-            left_s = deadline_s - time.monotonic()
         self.statistics.n_timeouts += not damage
-        raise _AttemptError(damage or self._silence(heard))
+        raise AttemptError(damage or self._silence(heard))
+
+    def _patience_s(self) -> float:
+        hurried_timeout_s = self._hurried_timeout_s  # another thread may change it
+        return (
+            self._settings.timeout_s if hurried_timeout_s is None else min(hurried_timeout_s, self._settings.timeout_s)
+        )
 
     def _messages(self) -> Iterator[Message | RemoteProtocolError]:
         """Whole messages and damage among what has arrived, in order."""
@@ -214,7 +240,7 @@ class Line(Generic[Message]):
 
     def _silence(self, heard: bytes) -> str:
         came = f"only {heard[:40].hex(' ')}" if heard else "nothing"
-        return f"{came} within {self._settings.timeout_s} s"
+        return f"{came} within {self._patience_s():g} s"
 
     def _rest(self) -> None:
         """Throw away what arrived since, and keep the line's turnaround."""
@@ -229,8 +255,8 @@ class Line(Generic[Message]):
         deadline_s = time.monotonic() + _N_SILENCES * self._settings.silence_s
         while data := self._transport.read(_READ_SIZE, self._settings.silence_s):
             self.statistics.n_garbage_bytes += len(data)
-            if time.monotonic() > deadline_s:
-                raise _AttemptError(f"the line is never silent, last came {data[:40].hex(' ')}")
+            if time.monotonic() > deadline_s or self.is_hurried:
+                raise AttemptError(f"the line is never silent, last came {data[:40].hex(' ')}")
 
 
 class TmclLink(Line[tmcl.Reply]):
@@ -259,11 +285,15 @@ class TmclLink(Line[tmcl.Reply]):
         """
 
         def attempt() -> tmcl.Reply:
-            if request.module not in self._in_step:
+            if request.module not in self._in_step and not self.is_hurried:
                 self._get_in_step(request.module)
+                self._in_step.add(request.module)
+            is_in_step = request.module in self._in_step
             # whatever ends the question before its answer (Ctrl-C too) leaves the module out of step
             self._in_step.discard(request.module)
             reply = self._ask(request, None)
+            if not is_in_step:
+                raise AttemptError("told in a hurry; what came may answer an earlier question")
             self._in_step.add(request.module)
             return reply
 
@@ -277,9 +307,9 @@ class TmclLink(Line[tmcl.Reply]):
             if (reply.host, reply.module) != (self._host, request.module):
                 return None
             if reply.status == tmcl.Status.WRONG_CHECKSUM:
-                raise _AttemptError("the module received a damaged request")
+                raise AttemptError("the module received a damaged request")
             if reply.status not in tmcl.STATUS_WORDS:
-                raise _AttemptError(f"a reply with {tmcl.status_words(reply.status)}")
+                raise AttemptError(f"a reply with {tmcl.status_words(reply.status)}")
             is_answer = reply.command == request.command and value in (None, reply.value)
             return reply if is_answer else None
 
@@ -323,7 +353,7 @@ class ZaberLink(Line[zaber_ascii.Answer]):
                     return None
                 if not message.has_checksum and device in self._summing:
                     # the command has lost its own, too: what the device did may not be what it was told
-                    raise _AttemptError("a reply without checksum from a device that sends one")
+                    raise AttemptError("a reply without checksum from a device that sends one")
                 return message
 
             question = zaber_ascii.Command(device, axis, words, message_id).encode()

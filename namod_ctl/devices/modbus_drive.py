@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 import time
-import tomllib
 from collections.abc import Iterable
-from pathlib import Path
 
-import namod_ctl
 from firmware_protocols.errors import LocalProtocolError, RemoteProtocolError
 from firmware_protocols.modbus_drive import (
     Condition,
+    ReadBlock,
     Register,
     RegisterMap,
     RunUnless,
@@ -20,7 +18,6 @@ from firmware_protocols.modbus_drive import (
     WritePosition,
     WriteTarget,
 )
-from firmware_protocols.modbus_map import RegisterMapError, read_register_map
 from namod_ctl.core.drives import DriveState
 from namod_ctl.core.errors import CommunicationError, ConfigError, DeviceFaultError
 from namod_ctl.devices.modbus_link import ModbusLink
@@ -87,6 +84,11 @@ class ModbusDrive:
             for condition in register_map.conditions.values()
             if condition.fault is not None or condition.name in ("moving", "homed")
         ]
+        self._condition_blocks = register_map.reads(
+            term.register for condition in register_map.conditions.values() for term in condition.terms
+        )
+        self._resting_temperature_k: float | None = None
+        self._is_temperature_known = False
 
     @property
     def name(self) -> str:
@@ -119,7 +121,7 @@ class ModbusDrive:
         return ", ".join([self._map.name, *(f"{name} {raws[name]:g}" for name in self._map.identity)])
 
     def state(self) -> DriveState:
-        """The drive's state now; its temperature only while it stands, to keep the bus free."""
+        """The drive's state now; its temperature as it came to rest, read once in each rest, to keep the bus free."""
         names = {term.register for condition in self._state_conditions for term in condition.terms}
         names.add(self._map.position)
         if "moving" not in self._map.conditions:
@@ -149,14 +151,17 @@ class ModbusDrive:
             Besides what `Drive` says: the drive is not homed, so it does not know where the position is.
         """
         self._scale.steps_at(position_m, self._name)
-        if not self._check_ready():
+        raws = self._read_conditions("fault", "homed")
+        if not self._check_ready(raws):
             raise DeviceFaultError(f"{self._name} is not homed (was it without power?): home it before it is moved")
-        self._run("move", self._target.raw_of(self._value_at(position_m)))
+        self._is_temperature_known = False
+        self._run("move", self._target.raw_of(self._value_at(position_m)), raws)
 
     def start_homing(self) -> None:
         """Begin to seek the reference; nothing to do for drives that need none."""
         if self._map.has_homing:
-            self._check_ready()
+            self._check_ready(self._read_conditions("fault", "homed"))
+            self._is_temperature_known = False
             self.configure()
             self._run("home")
 
@@ -188,17 +193,21 @@ class ModbusDrive:
             ) from None
         return raw
 
-    def _check_ready(self) -> bool:
+    def _check_ready(self, raws: dict[str, float]) -> bool:
         """Whether it is homed. Raises DeviceFaultError while a fault must be cleared first."""
         known = self._map.conditions
-        wanted = [known[name] for name in ("fault", "homed") if name in known]
-        raws = self._read(term.register for condition in wanted for term in condition.terms)
         if "fault" in known and known["fault"].holds(raws):
             raise DeviceFaultError(f"{self._name}: {self._fault_words(known['fault'])}; clear its faults first")
         return not self._map.has_homing or known["homed"].holds(raws)
 
-    def _run(self, sequence: str, target_raw: float | None = None) -> None:
+    def _run(self, sequence: str, target_raw: float | None = None, seen: dict[str, float] | None = None) -> None:
+        """Do what a sequence of the map says. What was `seen` since the last write is not asked again."""
+        seen = dict(seen or {})
         for step in self._map.sequences[sequence]:
+            if isinstance(step, WaitFor | RunUnless):
+                condition = step.condition if isinstance(step, WaitFor) else step.unless
+                if any(term.register not in seen for term in self._map.conditions[condition].terms):
+                    seen |= self._read_conditions(condition)
             match step:
                 case WriteConstant():
                     self._write(self._map.registers[step.register], step.raw)
@@ -209,9 +218,13 @@ class ModbusDrive:
                     here = position.value_of(self._read([position.name])[position.name])
                     self._write(self._target, self._target.raw_of(here))
                 case WaitFor():
-                    self._wait(step)
-                case RunUnless() if not self._holds(self._map.conditions[step.unless]):
+                    seen = self._wait(step, seen)
+                    continue
+                case RunUnless() if not self._map.conditions[step.unless].holds(seen):
                     self._run(step.sequence)
+                case RunUnless():
+                    continue
+            seen = {}
 
     def _write_target(self, raw: float) -> None:
         """Give the target; a drive that understood another one is stopped."""
@@ -227,17 +240,23 @@ class ModbusDrive:
                 "it was stopped. Check its own limits and its register map"
             )
 
-    def _wait(self, step: WaitFor) -> None:
+    def _wait(self, step: WaitFor, seen: dict[str, float]) -> dict[str, float]:
+        """What was seen last, when it is as it should be; `seen` is the first look."""
         condition = self._map.conditions[step.condition]
         deadline_s = time.monotonic() + step.timeout_s
-        while self._holds(condition) != step.holds:  # every look is an exchange, which takes its time on the line
+        while condition.holds(seen) != step.holds:
             if time.monotonic() > deadline_s:
                 faults = "; ".join(self.state().faults) or "it reports no fault"
                 wanted = condition.name if step.holds else f"not {condition.name}"
                 raise DeviceFaultError(f"{self._name} is not '{wanted}' after {step.timeout_s:g} s: {faults}")
+            seen = self._read_conditions(condition.name)  # an exchange, which takes its time on the line
+        return seen
 
-    def _holds(self, condition: Condition) -> bool:
-        return condition.holds(self._read(term.register for term in condition.terms))
+    def _read_conditions(self, *names: str) -> dict[str, float]:
+        """What these conditions look at, and what stands in the same requests: the next step may want it."""
+        known = [self._map.conditions[name] for name in names if name in self._map.conditions]
+        wanted = {term.register for condition in known for term in condition.terms}
+        return self._read_blocks(block for block in self._condition_blocks if not wanted.isdisjoint(block.names))
 
     def _faults(self, raws: dict[str, float]) -> tuple[str, ...]:
         return tuple(
@@ -256,12 +275,18 @@ class ModbusDrive:
 
     def _temperature_k(self) -> float | None:
         name = self._map.temperature
-        return None if name is None else self._map.registers[name].value_of(self._read([name])[name])
+        if name is not None and not self._is_temperature_known:
+            self._resting_temperature_k = self._map.registers[name].value_of(self._read([name])[name])
+            self._is_temperature_known = True
+        return self._resting_temperature_k
 
     def _read(self, names: Iterable[str]) -> dict[str, float]:
         """Raw values by name."""
+        return self._read_blocks(self._map.reads(names))
+
+    def _read_blocks(self, blocks: Iterable[ReadBlock]) -> dict[str, float]:
         raws: dict[str, float] = {}
-        for block in self._map.reads(names):
+        for block in blocks:
             words = self._link.read(self._unit, block.function, block.address, block.count)
             try:
                 raws |= self._map.decode_block(block, words)
@@ -273,42 +298,3 @@ class ModbusDrive:
         if register.write is None:
             raise TypeError(f"the map of {self._name} lets register {register.name} not be written")
         self._link.write(self._unit, register.write, register.address, register.encode_raw(raw))
-
-
-def builtin_map_names() -> list[str]:
-    """Names of the register maps that come with the program, such as `cia402`."""
-    return sorted(path.stem for path in _builtin_folder().glob("*.toml"))
-
-
-def load_register_map(path_or_builtin_name: str | Path) -> RegisterMap:
-    """The register map of a built-in name or a TOML file.
-
-    Raises
-    ------
-    ConfigError
-        The file is absent or no TOML, or all that is wrong with the map, each problem on a line with file, key, value,
-        rule and remedy.
-    """
-    path = Path(path_or_builtin_name)
-    if not path.is_file() and str(path_or_builtin_name) in builtin_map_names():
-        path = _builtin_folder() / f"{path_or_builtin_name}.toml"
-    try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(
-            f"{path_or_builtin_name}: no readable register map ({error.strerror}); give the path of a TOML file or a "
-            f"built-in name: {', '.join(builtin_map_names())}"
-        ) from None
-    except (ValueError, RecursionError) as error:  # of encoding, syntax, endless nesting
-        raise ConfigError(f"{path}: not valid TOML: {error}") from None
-    try:
-        return read_register_map(raw)
-    except RegisterMapError as error:
-        raise ConfigError("\n".join(f"{path}: {problem}" for problem in error.problems)) from None
-
-
-def _builtin_folder() -> Path:
-    """Inside the installed package, or beside it in a checkout."""
-    package = Path(namod_ctl.__file__).parent
-    inside = package / "config"
-    return (inside if inside.is_dir() else package.parent / "config") / "drives"

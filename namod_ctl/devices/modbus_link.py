@@ -30,7 +30,7 @@ from pymodbus.pdu.register_message import (
 from firmware_protocols.errors import RemoteProtocolError
 from namod_ctl.core.drives import ByteTransport
 from namod_ctl.core.errors import CommunicationError, DeviceFaultError
-from namod_ctl.devices.links import Line, LineSettings
+from namod_ctl.devices.links import AttemptError, Line, LineSettings
 
 _MBAP_LENGTH = 7  # bytes of the header of Modbus TCP: transaction, protocol, length, unit
 _MAX_PDU = 253
@@ -248,15 +248,20 @@ class ModbusLink(Line[ModbusPDU]):
 
     def _answer(self, who: str, unit: int, request: ModbusPDU) -> ModbusPDU:
         n_sent = 0
+        is_in_step = unit not in self._doubts
 
         def attempt() -> ModbusPDU:
-            nonlocal n_sent
-            if n_sent == 0 and unit in self._doubts:
+            nonlocal n_sent, is_in_step
+            if not is_in_step and not self.is_hurried:
                 self._get_in_step(unit, request)
+                is_in_step = True
             n_sent += 1
             if self._framing is Framing.RTU:
-                self._doubts[unit] = {request.count}
-            return self._ask(unit, request)
+                self._doubts.setdefault(unit, set()).add(request.count)
+            answer = self._ask(unit, request)
+            if not is_in_step:
+                raise AttemptError("told in a hurry; what came may answer an earlier request")
+            return answer
 
         answer = self.persist(who, attempt)
         if n_sent == 1:
@@ -282,7 +287,12 @@ class ModbusLink(Line[ModbusPDU]):
     def _outwait(self, silence_s: float) -> None:
         """Listen until nothing has come for so long; a line that babbles on is left to the next question to judge."""
         end_s = time.monotonic() + 2.0 * silence_s
-        while (data := self._transport.read(_MAX_RTU_FRAME, silence_s)) and time.monotonic() < end_s:
+        quiet_s = 0.0
+        while quiet_s < silence_s and time.monotonic() < end_s:
+            if self.is_hurried:
+                raise AttemptError("it was to be outwaited, and then there was a hurry")
+            data = self._transport.read(_MAX_RTU_FRAME, self._settings.timeout_s)
+            quiet_s = 0.0 if data else quiet_s + self._settings.timeout_s
             self.statistics.n_garbage_bytes += len(data)
 
     def _ask(self, unit: int, request: ModbusPDU, *, takes_refusal: bool = True) -> ModbusPDU:

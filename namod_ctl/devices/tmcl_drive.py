@@ -91,7 +91,10 @@ class TmclDrive:
         self._is_ordered = False
         self._is_seeking = False
         self._may_seek = True  # until a search has been stopped nobody knows: another program may have begun one
+        self._was_homed = False
         self._not_offered: set[tuple[int, int]] = set()
+        self._resting_temperature_k: float | None = None
+        self._is_temperature_known = False
 
     @property
     def name(self) -> str:
@@ -124,7 +127,11 @@ class TmclDrive:
         return tmcl.firmware_text(self._value(Command.GET_FIRMWARE_VERSION, 1, 0))
 
     def state(self) -> DriveState:
-        """The drive's state now. A standing drive's position is read until two readings agree."""
+        """The drive's state now. A standing drive's position is read until two readings agree.
+
+        To keep the bus free, the temperature is read once in each rest, and the flag of a drive that was homed not
+        while it moves: a reset brings it to rest.
+        """
         if self._is_search_active():
             return DriveState(math.nan, is_moving=True, is_homed=False)
         is_reached = self._flag(AxisParameter.POSITION_REACHED)
@@ -136,7 +143,8 @@ class TmclDrive:
                 faults += self._limit_faults()
                 # nothing holds it, so it has not gathered speed yet
                 is_moving = not faults
-        is_homed = self._variable() == HOMED
+        is_homed = (is_moving and self._was_homed) or self._variable() == HOMED
+        self._was_homed = is_homed
         steps = self._parameter(AxisParameter.ACTUAL_POSITION) if is_moving else self._standing_position()
         return DriveState(
             self._scale.position_m_at(steps) if is_homed else math.nan,
@@ -149,7 +157,10 @@ class TmclDrive:
     def start_move(self, position_m: float) -> None:
         """Begin to move to an absolute position; the target is read back before it is believed."""
         steps = self._scale.steps_at(position_m, self._name)
+        if self._may_seek:  # asked once: a stop then need not think of searches
+            self._may_seek = bool(self._offered(Command.RFS, ReferenceSearch.STATUS, self._motor))
         self._is_ordered = True
+        self._is_temperature_known = False
         for _ in range(_N_READINGS):
             self._value(Command.MVP, tmcl.MoveType.ABS, self._motor, steps)
             if self._parameter(AxisParameter.TARGET_POSITION) == steps:
@@ -160,22 +171,24 @@ class TmclDrive:
     def start_homing(self) -> None:
         """Begin the reference search; the drive is not homed until it has ended."""
         self.configure()
-        self._is_seeking, self._may_seek = False, True
+        self._is_seeking, self._may_seek, self._was_homed = False, True, False
+        self._is_temperature_known = False
         self._set_variable(SEEKING)
         self._value(Command.RFS, ReferenceSearch.START, self._motor)
         # only now: a search that was never begun must not count as one that has ended
         self._is_seeking = True
 
     def stop(self) -> None:
-        """Halt; a search that was under way leaves the drive not homed."""
+        """Halt; a search that was under way leaves the drive not homed. The halt goes first: it is what counts."""
         self._is_ordered = False
         self._is_seeking = False
         try:
-            if self._may_seek:
-                self._value(Command.RFS, ReferenceSearch.STOP, self._motor)
-                self._may_seek = False
-        finally:
             self._value(Command.MST, 0, self._motor)
+        finally:
+            if self._may_seek:
+                self._offered(Command.RFS, ReferenceSearch.STOP, self._motor)
+                self._value(Command.MST, 0, self._motor)  # the search may have gone on in between
+                self._may_seek = False
 
     def clear_faults(self) -> None:
         """Modules drop their error flags at the next motion command: a stop is the harmless one."""
@@ -211,8 +224,11 @@ class TmclDrive:
         return tuple(found)
 
     def _temperature_k(self) -> float | None:
-        celsius = self._offered(Command.GIO, tmcl.TEMPERATURE_PORT, tmcl.ANALOG_BANK)
-        return None if celsius is None else celsius_to_k(float(celsius))
+        if not self._is_temperature_known:
+            celsius = self._offered(Command.GIO, tmcl.TEMPERATURE_PORT, tmcl.ANALOG_BANK)
+            self._resting_temperature_k = None if celsius is None else celsius_to_k(float(celsius))
+            self._is_temperature_known = True
+        return self._resting_temperature_k
 
     def _standing_position(self) -> int:
         """Two equal readings: the sum of a frame misses some pairs of wrong bits, and legs are judged by it."""

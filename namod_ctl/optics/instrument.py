@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,8 @@ class Instrument:
         Smallest turn of a bolt a person can make and check.
     star_size_rad
         Expected diameter of a star's image in the star camera (0.025 deg at FACT); the star finder's yardstick.
+    bolts_seen_from
+        Where people stand when they turn bolts: sheets are drawn as seen from there. No number depends on it.
     """
 
     name: str
@@ -40,3 +43,4 @@ class Instrument:
     facet_polygons_px: Mapping[int, Array]
     goniometer_resolution_rad: float
     star_size_rad: float
+    bolts_seen_from: Literal["front", "back"] = "back"

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from namod_ctl.core.errors import ConfigError, StoreError
 from namod_ctl.store.database import BUSY_TIMEOUT_S, store_errors, transaction
+from namod_ctl.store.folders import named_near
 
 CAMPAIGN_DATABASE_NAME = "campaign.sqlite"
 CAMPAIGN_SCHEMA_VERSION = 1
@@ -62,7 +63,8 @@ def require_campaign(path: Path) -> None:
     """Raise ConfigError when there is no campaign at `path`."""
     if not is_campaign(path):
         raise ConfigError(
-            f"{path}: there is no campaign here ({CAMPAIGN_DATABASE_NAME} is missing); begin one with 'namod-ctl align'"
+            f"{path}: there is no campaign here ({CAMPAIGN_DATABASE_NAME} is missing){named_near(path, is_campaign)}; "
+            "begin one with 'namod-ctl align'"
         )
 
 

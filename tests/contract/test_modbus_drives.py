@@ -15,8 +15,9 @@ from drive_contract import RANGE_M, START_M, DriveContract, DriveRig
 from twin_rigs import MOTOR, SPEEDS, Wire, rig_of
 
 from namod_ctl.core.errors import DeviceFaultError
+from namod_ctl.devices.drive_maps import load_register_map
 from namod_ctl.devices.links import LineSettings
-from namod_ctl.devices.modbus_drive import ModbusDrive, load_register_map
+from namod_ctl.devices.modbus_drive import ModbusDrive
 from namod_ctl.devices.modbus_link import Framing, ModbusLink
 from namod_ctl.devices.transports import LoopbackTransport
 from namod_ctl.twin.drive_modbus import ModbusRtuLine, ModbusTcpLine

@@ -18,8 +18,9 @@ import pytest
 
 from namod_ctl.core.errors import CommunicationError, DeviceFaultError
 from namod_ctl.core.units import mm_to_m
+from namod_ctl.devices.drive_maps import load_register_map
 from namod_ctl.devices.links import LineSettings
-from namod_ctl.devices.modbus_drive import ModbusDrive, load_register_map
+from namod_ctl.devices.modbus_drive import ModbusDrive
 from namod_ctl.devices.modbus_link import Framing, ModbusLink
 from namod_ctl.devices.transports import open_transport
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from types import FrameType
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -137,6 +137,10 @@ def _resumed(
         raise ConfigError("--resume CAMPAIGN goes on with the campaign's own config and twin: leave the others out")
     store = stack.enter_context(CampaignStore.open(path, read_only=False))
     noted = noted_twin(store)
+    if noted is None and store.last_state() is None:
+        raise ConfigError(
+            f"{path}: was killed in its first moment and is empty: begin it again, with --out and --force"
+        )
     if noted is None:
         raise ConfigError(f"{path}: was not begun on the twin, and there are no drivers for cameras yet")
     return _Start(store, InstrumentConfig.from_json(store.config_json, f"{path}: config"), *noted)
@@ -162,13 +166,11 @@ def _has_ended(store: CampaignStore, console: Console) -> bool:
 def _wishes(store: CampaignStore, records: int | None, cycles: int | None, approve: Approve | None) -> CampaignSettings:
     """What the crew wishes; noted in the campaign, which goes on with it after a restart."""
     given = {"records": records, "cycles": cycles, "approve": approve}
-    wishes = {"records": DEFAULT_RECORDS, "cycles": DEFAULT_CYCLES, "approve": Approve.AUTO}
+    wishes: dict[str, Any] = {"records": DEFAULT_RECORDS, "cycles": DEFAULT_CYCLES, "approve": Approve.AUTO}
     wishes |= json.loads(store.note(NOTE_WISHES) or "{}")
     wishes |= {name: wish for name, wish in given.items() if wish is not None}
     store.set_note(NOTE_WISHES, json.dumps(wishes))
-    return CampaignSettings(
-        RecordSettings(), int(wishes["records"]), int(wishes["cycles"]), wishes["approve"] == Approve.ASK
-    )
+    return CampaignSettings(RecordSettings(), wishes["records"], wishes["cycles"], wishes["approve"] == Approve.ASK)
 
 
 @contextmanager

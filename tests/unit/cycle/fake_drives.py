@@ -12,6 +12,7 @@ from namod_ctl.core.units import mm_to_m, um_to_m
 
 SPEED_M_PER_S = mm_to_m(1.0)
 STEP_M = um_to_m(3.0)
+HURRIED_S = 0.03
 RANGE_M = (mm_to_m(-5.0), mm_to_m(5.0))
 
 
@@ -45,6 +46,7 @@ class FakeDrive:
     barrier_m: float = math.inf
     lost_share: float = 0.0
     timeouts_take_s: float = 0.0
+    is_hurried: bool = False
     refuses_stops: bool = False
     range_m: tuple[float, float] = RANGE_M
     resolution_m: float = STEP_M
@@ -80,7 +82,7 @@ class FakeDrive:
         if self.bug is not None:
             raise self.bug
         if self.silent_s[0] <= self.clock.now_s < self.silent_s[1]:
-            self.clock.now_s += self.timeouts_take_s
+            self.clock.now_s += min(self.timeouts_take_s, HURRIED_S) if self.is_hurried else self.timeouts_take_s
             raise CommunicationError(f"{self.name}: no answer")
 
     def state(self) -> DriveState:
@@ -129,6 +131,11 @@ class FakeBus:
     name: str
     drives: dict[Leg, Drive]
     max_moving: int = 3
+
+    def hurry(self, is_hurried: bool) -> None:
+        for drive in self.drives.values():
+            if isinstance(drive, FakeDrive):
+                drive.is_hurried = is_hurried
 
     def scan(self) -> list[str]:
         return []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import threading
 from collections.abc import Callable
 
 import pytest
@@ -215,3 +216,24 @@ def test_homing(rig: Rig) -> None:
     assert (homed[Leg(1, 0)], homed[Leg(1, 1)]) == ("", "")
     assert "no answer" in homed[Leg(4, 0)]
     assert rig.drives[Leg(1, 1)].true_m() == pytest.approx(0.0)
+
+
+def test_a_bus_does_not_wait_for_a_slow_one(rig: Rig) -> None:
+    """Bus B hangs in one question until all legs on bus A have arrived, in batches of three."""
+    is_over = threading.Event()
+    was_in_time: list[bool] = []
+    slow = rig.drives[Leg(4, 0)]
+
+    def hang() -> None:
+        if slow.moves() and not was_in_time:
+            was_in_time.append(is_over.wait(5.0))
+
+    def look() -> None:
+        rig.clock.wait_s(0.1)  # time passes by itself, as it does outside of the twin
+        if sum(result.order.leg.facet_id <= 3 for result in rig.told) == 6:
+            is_over.set()
+
+    slow.on_question = hang
+    results = rig.execute(while_waiting=look)
+    assert was_in_time == [True]
+    assert {result.outcome for result in results.values()} == {MoveOutcome.ARRIVED}

@@ -8,11 +8,11 @@ import threading
 from collections.abc import Callable
 
 import pytest
-from fake_drives import TestClock
+from fake_drives import HURRIED_S, FakeDrive, TestClock
 from mover_rig import STOPPED_WITHIN_S, Rig
 
 from namod_ctl.core.drives import Leg
-from namod_ctl.core.errors import StoreError
+from namod_ctl.core.errors import CommunicationError, StoreError
 from namod_ctl.core.motion import MoveOrder, MoveOutcome, MoveResult
 from namod_ctl.core.units import mm_to_m
 
@@ -188,3 +188,29 @@ def test_stop_all_says_what_became_of_every_drive(rig: Rig) -> None:
     assert "did not take its stop" in words[Leg(4, 0)]
     assert rig.switch.reason == "emergency"
     assert set(words) == set(rig.drives)
+
+
+def test_all_that_move_are_told_in_a_hurry_though_nobody_answers(rig: Rig) -> None:
+    """All hear their stops and none is heard: with patience, four timeouts of 0.1 s each, the last would be late."""
+    told_s: dict[str, float] = {}
+
+    def unheard(drive: FakeDrive) -> Callable[[], None]:
+        def stop() -> None:
+            told_s.setdefault(drive.name, rig.clock.now_s)
+            rig.clock.now_s += HURRIED_S if drive.is_hurried else 0.4
+            raise CommunicationError(f"{drive.name}: no answer")
+
+        return stop
+
+    def throw() -> None:
+        for drive in rig.drives.values():
+            drive.stop = unheard(drive)  # type: ignore[method-assign]
+        rig.switch.throw("stop")
+
+    orders = rig.orders(legs=[leg for leg in rig.drives if leg.facet_id <= 3])  # all buses share the clock of the test
+    results = rig.execute(orders, after(rig.clock, 0.4, throw))
+    movers = {drive.name for drive in rig.drives.values() if drive.moves()}
+    assert len(movers) == 3
+    assert max(told_s[name] for name in movers) <= 0.45 + len(movers) * HURRIED_S
+    assert not any(drive.is_hurried for drive in rig.drives.values())
+    assert MoveOutcome.ARRIVED not in rig.outcomes(results)

@@ -229,3 +229,60 @@ def test_silence_names_the_drive_the_line_and_the_remedy():
         link.exchange(3, 2, "get pos")
     assert link.statistics.n_timeouts == 4
     assert link.statistics.n_retries == 3
+
+
+HURRIED_S = 0.03
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 2**32),
+    late=CHANCE,
+    lost=CHANCE,
+    questions=st.lists(
+        st.tuples(st.integers(1, 3), st.integers(0, 5), st.integers(0, 3), st.booleans()), min_size=1, max_size=25
+    ),
+)
+def test_no_reply_is_taken_for_another_in_a_hurry_either(seed, late, lost, questions):
+    link = TmclLink(VirtualLine(BadLuck(seed, late, lost, 0.0, 0.0).peer), SETTINGS)
+    for module, motor, type_, is_hurried in questions:
+        link.hurry(HURRIED_S if is_hurried else None)
+        request = read(module, motor, type_)
+        try:
+            reply = link.exchange(request)
+        except CommunicationError:
+            continue
+        assert reply.value == number_of(request)
+
+
+def test_in_a_hurry_all_modules_are_told_at_once_whoever_is_silent():
+    line = VirtualLine(lambda data: [])
+    link = TmclLink(line, SETTINGS)
+    link.hurry(HURRIED_S)
+    stops = [tmcl.Request(module, tmcl.Command.MST) for module in range(1, 16)]
+    for stop in stops:
+        with pytest.raises(CommunicationError, match="in one attempt"):
+            link.exchange(stop)
+    assert [data for _, data in line.written] == [stop.encode() for stop in stops]
+    assert line.written[-1][0] == pytest.approx(14 * HURRIED_S)
+    link.hurry(None)
+    with pytest.raises(CommunicationError, match="4 attempts"):
+        link.exchange(stops[0])
+
+
+def test_a_question_under_way_is_cut_short_when_a_hurry_begins():
+    line = VirtualLine(lambda data: [])
+    link = TmclLink(line, SETTINGS)
+    pass_on, reads_s = line.read, []
+
+    def read_and_hurry(n_max: int, timeout_s: float) -> bytes:
+        reads_s.append(timeout_s)
+        if sum(reads_s) > 0.05:
+            link.hurry(HURRIED_S)
+        return pass_on(n_max, timeout_s)
+
+    line.read = read_and_hurry
+    with pytest.raises(CommunicationError):
+        link.exchange(read(1, 0))
+    assert 0.05 < sum(reads_s) < 0.08
+    assert len(line.written) == 1

@@ -228,3 +228,45 @@ def test_an_exchange_adds_less_than_a_millisecond(framing: Framing) -> None:
         link.read(1, 3, 0, 2)
         times_s.append(time.process_time() - begin_s)
     assert sorted(times_s)[25] < 0.001
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 2**32),
+    late=CHANCE,
+    lost=CHANCE,
+    questions=st.lists(
+        st.tuples(
+            st.sampled_from(UNITS), st.sampled_from([3, 4]), st.integers(0, 50), st.integers(1, 3), st.booleans()
+        ),
+        min_size=1,
+        max_size=25,
+    ),
+)
+@pytest.mark.parametrize("framing", Framing)
+def test_no_answer_is_taken_for_another_in_a_hurry_either(framing, seed, late, lost, questions):
+    link = ModbusLink(VirtualLine(Bus(framing, seed, late, lost).peer), SETTINGS, framing)
+    for unit, function, address, count, is_hurried in questions:
+        link.hurry(0.03 if is_hurried else None)
+        try:
+            words = link.read(unit, function, address, count)
+        except CommunicationError:
+            continue
+        assert words == tuple(word_at(unit, function, at) for at in range(address, address + count))
+
+
+def test_a_unit_out_of_step_hears_its_stop_in_a_hurry_and_confirms_it_afterwards() -> None:
+    bus = Bus(Framing.RTU)
+    is_heard = False
+    line = VirtualLine(lambda data: bus.peer(data) if is_heard else [])
+    link = ModbusLink(line, SETTINGS, Framing.RTU)
+    with pytest.raises(CommunicationError):
+        link.read(1, 3, 0, 1)
+    is_heard = True
+    link.hurry(0.03)
+    with pytest.raises(CommunicationError, match="told in a hurry"):
+        link.write(1, 6, 9, [2])
+    assert bus.units[1].written == [(6, 9, (2,))]
+    link.hurry(None)
+    link.write(1, 6, 9, [2])
+    assert bus.units[1].written == [(6, 9, (2,))] * 2

@@ -22,8 +22,9 @@ from firmware_protocols.modbus_drive import RegisterImage, RegisterMap
 from firmware_protocols.modbus_map import read_register_map
 from namod_ctl.core.errors import CommunicationError, ConfigError, DeviceFaultError
 from namod_ctl.core.units import celsius_to_k, mm_to_m
+from namod_ctl.devices.drive_maps import builtin_map_names, load_register_map
 from namod_ctl.devices.links import LineSettings
-from namod_ctl.devices.modbus_drive import ModbusDrive, builtin_map_names, load_register_map
+from namod_ctl.devices.modbus_drive import ModbusDrive
 from namod_ctl.devices.modbus_link import Framing, ModbusLink
 from namod_ctl.devices.transports import LoopbackTransport
 from namod_ctl.twin.drive_modbus_units import Cia402Unit

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import pytest
 
 from firmware_protocols import tmcl
 from firmware_protocols.tmcl import AxisParameter, Command, Status
-from namod_ctl.core.errors import DeviceFaultError
+from namod_ctl.core.errors import CommunicationError, DeviceFaultError
 from namod_ctl.devices.links import LineSettings, TmclLink
 from namod_ctl.devices.tmcl_drive import HOMED, HOMED_VARIABLE, ReferenceSearchSettings, TmclDrive
 from namod_ctl.devices.transports import LoopbackTransport
@@ -24,6 +26,7 @@ class Module:
             (Command.GGP, HOMED_VARIABLE + MOTOR, tmcl.USER_BANK): HOMED,
         }
         self.refused: dict[tuple[int, int], Status] = {}
+        self.is_heard = True
 
     def receive(self, data: bytes) -> bytes:
         request = tmcl.Request.decode(data)
@@ -32,7 +35,7 @@ class Module:
             self.values[Command.GGP, request.type, request.motor] = request.value
         status = self.refused.get((request.command, request.type), Status.OK)
         value = self.values.get((request.command, request.type, request.motor), 0)
-        return tmcl.Reply(2, request.module, status, request.command, value).encode()
+        return tmcl.Reply(2, request.module, status, request.command, value).encode() if self.is_heard else b""
 
     def set(self, parameter: AxisParameter, value: int) -> None:
         self.values[Command.GAP, parameter, MOTOR] = value
@@ -46,8 +49,8 @@ def module() -> Module:
     return Module()
 
 
-def drive_of(module: Module, homing: ReferenceSearchSettings | None = None) -> TmclDrive:
-    link = TmclLink(LoopbackTransport("loopback://m", module.receive), LineSettings())
+def drive_of(module: Module, homing: ReferenceSearchSettings | None = None, link: TmclLink | None = None) -> TmclDrive:
+    link = link or TmclLink(LoopbackTransport("loopback://m", module.receive), LineSettings())
     return TmclDrive(
         link,
         MODULE,
@@ -146,3 +149,43 @@ def test_a_search_that_could_not_be_begun_does_not_count_as_ended(module):
 def test_identity(module):
     module.values[Command.GET_FIRMWARE_VERSION, 1, 0] = 0x17DE0115
     assert drive_of(module).identity() == "TMCM-6110 firmware 1.21"
+
+
+def test_a_stop_of_a_drive_that_was_seen_to_seek_nothing_is_one_request(module):
+    module.set(AxisParameter.TARGET_POSITION, -5000)
+    drive = drive_of(module)
+    drive.start_move(0.005)
+    module.requests.clear()
+    drive.stop()
+    assert [asked.command for asked in module.requests] == [Command.MST]
+
+
+@pytest.mark.parametrize("is_heard", [False, True])
+def test_a_stop_of_a_search_halts_first_and_ends_the_search_whether_heard_or_not(module, is_heard):
+    link = TmclLink(LoopbackTransport("loopback://m", module.receive), LineSettings())
+    drive = drive_of(module, link=link)
+    drive.start_homing()
+    module.requests.clear()
+    module.is_heard = is_heard
+    link.hurry(0.03)
+    with nullcontext() if is_heard else pytest.raises(CommunicationError):
+        drive.stop()
+    sent = [(asked.command, asked.type) for asked in module.requests]
+    assert sent[:2] == [(Command.MST, 0), (Command.RFS, tmcl.ReferenceSearch.STOP)]
+
+
+def test_while_it_moves_a_drive_is_asked_three_things(module):
+    module.set(AxisParameter.TARGET_POSITION, -5000)
+    drive = drive_of(module)
+    assert drive.state().is_homed
+    drive.start_move(0.005)
+    module.set(AxisParameter.POSITION_REACHED, 0)
+    module.set(AxisParameter.ACTUAL_SPEED, 900)
+    module.requests.clear()
+    assert drive.state().is_moving
+    assert len(module.requests) == 3
+    # it was reset in mid-move: it stands, and does not know where
+    module.set(AxisParameter.POSITION_REACHED, 1)
+    module.set(AxisParameter.ACTUAL_SPEED, 0)
+    module.values[Command.GGP, HOMED_VARIABLE + MOTOR, tmcl.USER_BANK] = 0
+    assert not drive.state().is_homed
