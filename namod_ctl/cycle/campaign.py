@@ -6,15 +6,15 @@ in the campaign's store before it is done, so that a campaign can be taken up af
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 from namod_ctl.core.clock import Clock
 from namod_ctl.core.errors import DataQualityError, NamodError, SafetyStop
 from namod_ctl.core.motion import StopSwitch
+from namod_ctl.cycle.campaign_memory import alignments_on_record, cycle_to_record, history_of, note_forecast
 from namod_ctl.cycle.campaign_parts import CampaignSettings, Outside, View
 from namod_ctl.cycle.control import ControlBox, Request, RequestKind
-from namod_ctl.cycle.convergence import Decision, Measurement, decide
+from namod_ctl.cycle.convergence import Decision, decide
 from namod_ctl.cycle.correct import Corrector, StopAsked
 from namod_ctl.cycle.machine import FINAL, CampaignMachine
 from namod_ctl.cycle.plan import Plan
@@ -32,7 +32,6 @@ MAX_POOR_RECORDINGS = 2
 """So often a recording that is unusable as a whole is repeated."""
 
 MAX_CHANGED_PREVIEWS = 3
-NOTE_FORECASTS = "forecasts"
 
 LISTENING = frozenset({"recording", "paused", "awaiting_approval", "awaiting_operator"})
 """States that answer requests themselves."""
@@ -113,7 +112,7 @@ class Campaign:
         self._machine.fire("ready", f"checked; {len(remarks)} remarks")
 
     def _in_recording(self) -> None:
-        cycle = self._cycle_to_record()
+        cycle = cycle_to_record(self._store)
         with self._run_of(cycle) as run:
             equipment = self._outside.equipment()
             recorder = Recorder(equipment, self._instrument, run, self._settings.record)
@@ -162,8 +161,10 @@ class Campaign:
             a_sigma_limit_rad2=self._settings.limit_rad2 or result.limit.a_sigma_rad2,
             alignment_json=self._outside.alignment_to_json(result.alignment),
         )
-        self._note_forecast(cycle.number, plan)
-        decision, why = decide(self._history(cycle, plan), self._settings.limit_rad2, self._settings.max_cycles)
+        note_forecast(self._store, cycle.number, plan)
+        decision, why = decide(
+            history_of(self._store, cycle, plan), self._settings.limit_rad2, self._settings.max_cycles
+        )
         if decision is Decision.VAGUE:
             self._record_again(why)
             return
@@ -282,7 +283,7 @@ class Campaign:
 
         Without it a plan would be made with the config's wiring, where the program knew better already.
         """
-        known = self._known_alignments()
+        known = alignments_on_record(self._store, self._outside.alignment_from_json)
         if self.state == "reconstructing":  # the last cycle is learned from there
             known.pop(self._store.cycles()[-1].number, None)
         for n_known in range(max(len(known) - 1, 1), len(known) + 1):
@@ -303,14 +304,6 @@ class Campaign:
         if n_undone or not self._corrector.can_undo:
             raise SafetyStop(f"{why}; {'it was undone once already' if n_undone else 'people must look'}")
         self._machine.fire("undo", why)
-
-    def _cycle_to_record(self) -> Cycle:
-        """The cycle that the next records belong to: the last one while it has no estimate, else a new one."""
-        cycles = self._store.cycles()
-        if cycles and cycles[-1].alignment_json is None:
-            return cycles[-1]
-        number = self._store.begin_cycle()
-        return next(cycle for cycle in self._store.cycles() if cycle.number == number)
 
     def _run_of(self, cycle: Cycle) -> RunStore:
         path = self._store.run_path(cycle.number)
@@ -333,37 +326,9 @@ class Campaign:
     def _alignments(self) -> dict[int, Alignment]:
         """Alignments of all cycles that have one, the present one included, by number."""
         assert self._result is not None
-        return self._known_alignments() | {self._store.cycles()[-1].number: self._result.alignment}
-
-    def _known_alignments(self) -> dict[int, Alignment]:
-        """Alignments that are on record, by number of their cycle."""
-        return {
-            cycle.number: self._outside.alignment_from_json(cycle.alignment_json, f"cycle {cycle.number}")
-            for cycle in self._store.cycles()
-            if cycle.alignment_json is not None
+        return alignments_on_record(self._store, self._outside.alignment_from_json) | {
+            self._store.cycles()[-1].number: self._result.alignment
         }
-
-    def _note_forecast(self, number: int, plan: Plan) -> None:
-        self._store.set_note(f"{NOTE_FORECASTS}.{number}", repr(plan.forecast.uncertainty_rad2))
-
-    def _history(self, last: Cycle, plan: Plan) -> list[Measurement]:
-        """Measurements since the campaign began, or since the last correction that was taken back."""
-        measured = [cycle for cycle in self._store.cycles() if cycle.number < last.number] + [last]
-        undone_in = {
-            int(number)
-            for event in self._store.events()
-            if event.kind == "undone_in" and isinstance(number := event.data.get("cycle"), int)
-        }
-        first = max(undone_in, default=0)
-        history = []
-        for cycle in measured:
-            if cycle.number <= first or not math.isfinite(cycle.a_sigma_now_rad2):
-                continue
-            doubt = float(self._store.note(f"{NOTE_FORECASTS}.{cycle.number}") or "nan")
-            history.append(Measurement.of(cycle, doubt))
-        if history:
-            history[-1] = replace(history[-1], possible=plan.possible, is_trying=bool(plan.tried))
-        return history
 
     def _requests(self) -> list[Request]:
         """Requests from elsewhere; one that asks to stop is obeyed here.
