@@ -129,8 +129,8 @@ class AlignView(View):
 def cycle_table(cycles: list[Cycle]) -> Table:
     """One row per cycle."""
     table = Table()
-    for name in ("cycle", "records", "A_sigma / arcmin2", "predicted", "what was decided"):
-        table.add_column(name, justify="left" if name.startswith("what") else "right")
+    for name in ("cycle", "records", "A_sigma / arcmin2", "predicted", "decision"):
+        table.add_column(name, justify="left" if name == "decision" else "right")
     for cycle in cycles:
         now, doubt, predicted = (
             rad2_to_arcmin2(area)
@@ -141,6 +141,6 @@ def cycle_table(cycles: list[Cycle]) -> Table:
             str(cycle.n_records),
             f"{now:.2f} +- {doubt:.2f}",
             f"{predicted:.2f}",
-            escape(cycle.decision),
+            cycle.decision.split(":")[0],
         )
     return table

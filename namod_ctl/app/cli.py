@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from difflib import get_close_matches
 from importlib import import_module
 from typing import Any
 
@@ -10,17 +11,22 @@ import typer
 from typer.core import TyperGroup
 
 from namod_ctl import __version__
+from namod_ctl.app.greeting import GREETING
 from namod_ctl.core.errors import NamodError
 
 # A command's module is imported when the command is called, so that none waits for the libraries of another.
 _COMMANDS = {
     "config": "namod_ctl.app.commands.config:app",
+    "facets": "namod_ctl.app.commands.facets:app",
     "import": "namod_ctl.app.commands.imports:app",
     "record": "namod_ctl.app.commands.record:record",
     "align": "namod_ctl.app.commands.align:align",
     "actuators": "namod_ctl.app.commands.actuators:app",
+    "dashboard": "namod_ctl.app.commands.dashboard:dashboard",
     "reconstruct": "namod_ctl.app.commands.reconstruct:reconstruct_run",
     "instruct": "namod_ctl.app.commands.instruct:instruct",
+    "report": "namod_ctl.app.commands.report:report",
+    "compare": "namod_ctl.app.commands.compare:compare",
     "export": "namod_ctl.app.commands.export:export",
     "raytrace": "namod_ctl.app.commands.raytrace:raytrace",
     "status": "namod_ctl.app.commands.status:status",
@@ -53,11 +59,19 @@ class _Commands(TyperGroup):
         command.name = cmd_name
         return command
 
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        if args and args[0] not in _COMMANDS and not args[0].startswith("-"):
+            near = get_close_matches(args[0], _COMMANDS)
+            hint = f"Did you mean {' or '.join(map(repr, near))}?" if near else "namod-ctl --help lists all commands."
+            ctx.fail(f"No such command {args[0]!r}. {hint}")
+        return super().resolve_command(ctx, args)
+
 
 app = typer.Typer(
     cls=_Commands,
     help="Align the segmented mirror of a Cherenkov telescope with two cameras, by the NAMOD method.",
-    no_args_is_help=True,
+    epilog="Let the Tab key complete commands and options: namod-ctl --install-completion",
+    invoke_without_command=True,
     add_completion=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -72,9 +86,11 @@ def _print_version(is_asked: bool) -> None:
 
 @app.callback()
 def _root(
+    ctx: typer.Context,
     version: bool = typer.Option(False, "--version", callback=_print_version, is_eager=True, help="Print the version."),
 ) -> None:
-    pass
+    if ctx.invoked_subcommand is None:
+        typer.echo(GREETING if sys.stdout.isatty() else ctx.get_help())
 
 
 def main() -> None:

@@ -1,6 +1,7 @@
 """instructions.pdf: A4 sheets for the people who turn the bolts, one sheet per place of the ladder.
 
-Black on white and told apart by words and shapes, never by colour: sheets are read under red light.
+Black on white and told apart by words and shapes, never by colour: sheets are read under red light. Everything is drawn
+as the person who turns the bolts sees it: from behind the mirror left and right are exchanged against telescope x.
 """
 
 from __future__ import annotations
@@ -9,13 +10,14 @@ import io
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Rectangle
+from matplotlib.patches import Circle, Polygon, Rectangle
 from numpy.typing import NDArray
 
 from namod_ctl.app.facet_map import outlines_m
@@ -36,6 +38,7 @@ _TABLE_TOP_MM, _TABLE_BOTTOM_MM = 203.0, 14.0
 _SMALLEST_MAP_LETTERS_PT = 4.5
 _MAP_MM = (132.0, 212.0, 64.0, 64.0)  # left, bottom, width, height
 _BOLTS_PER_LINE = 3
+_ARROW_RADIUS_MM = 5.2
 _REACH_IN_FACETS = 0.75  # a person on a ladder reaches facets whose centres are this much of a facet's width further
 
 
@@ -47,14 +50,17 @@ class Sheet:
     facet_ids: tuple[int, ...]
 
 
-def plan_sheets(reflector: Reflector, facet_ids: Sequence[int]) -> tuple[Sheet, ...]:
+def plan_sheets(
+    reflector: Reflector, facet_ids: Sequence[int], seen_from: Literal["front", "back"] = "front"
+) -> tuple[Sheet, ...]:
     """Sheets in the order of work: the ladder moves from left to right once, at each place people climb upwards once.
 
-    Left and right, up and down are those of a person who looks at the reflector from its focal point. At one place
+    Left and right are those of a person in front of the reflector, at its focal point, or behind it. At one place
     of the ladder lie the facets whose centres are within 0.75 of a facet's width; where these are more than
     fit on a sheet, they are split into sheets of equal length.
     """
-    positions = {facet.id: facet.position_m for facet in reflector.facets}
+    to_view = _to_view(seen_from)
+    positions = {facet.id: to_view * facet.position_m[:2] for facet in reflector.facets}
     reach_m = _REACH_IN_FACETS * float(np.median([facet.width_m for facet in reflector.facets]))
     from_left = sorted(facet_ids, key=lambda facet_id: float(positions[facet_id][0]))
     places: list[list[int]] = []
@@ -69,6 +75,11 @@ def plan_sheets(reflector: Reflector, facet_ids: Sequence[int]) -> tuple[Sheet, 
         parts = np.array_split(np.array(upwards), n_sheets)
         sheets += [Sheet(number, tuple(int(facet_id) for facet_id in part)) for part in parts]
     return tuple(sheets)
+
+
+def _to_view(seen_from: Literal["front", "back"]) -> Array:
+    """Factors of telescope x and y that give right and up as a person sees them."""
+    return np.array([-1.0 if seen_from == "back" else 1.0, 1.0])
 
 
 def sheets_to_pdf(instrument: Instrument, instructions: Sequence[FacetInstruction], headline: str) -> bytes:
@@ -89,13 +100,14 @@ def _pages(instrument: Instrument, instructions: Sequence[FacetInstruction], hea
         yield page
         return
     by_id = {instruction.facet_id: instruction for instruction in instructions}
-    outlines = outlines_m(instrument.reflector)
-    sheets = plan_sheets(instrument.reflector, list(by_id))
+    to_view = _to_view(instrument.bolts_seen_from)
+    outlines = {facet_id: to_view * outline for facet_id, outline in outlines_m(instrument.reflector).items()}
+    sheets = plan_sheets(instrument.reflector, list(by_id), instrument.bolts_seen_from)
     for number, sheet in enumerate(sheets, start=1):
         page, axes = _blank_page()
         _draw_header(axes, instrument, headline, f"Sheet {number} of {len(sheets)} · ladder place {sheet.place}")
         _draw_key_map(page, outlines, sheet)
-        _draw_table(axes, instrument.mounts, [by_id[facet_id] for facet_id in sheet.facet_ids])
+        _draw_table(axes, instrument, [by_id[facet_id] for facet_id in sheet.facet_ids])
         yield page
 
 
@@ -109,23 +121,30 @@ def _blank_page() -> tuple[Figure, Axes]:
     return page, axes
 
 
-def _write(axes: Axes, x_mm: float, y_mm: float, text: str, size_pt: float, **style: str) -> None:
+def _write(axes: Axes, x_mm: float, y_mm: float, text: str, size_pt: float, **style: str | float) -> None:
     axes.text(x_mm, y_mm, text, fontsize=size_pt, color="black", **({"va": "top", "ha": "left"} | style))  # type: ignore[arg-type]
 
 
 def _draw_header(axes: Axes, instrument: Instrument, headline: str, sheet_name: str) -> None:
     _write(axes, _LEFT_MM, 285.0, sheet_name, 17, weight="bold")
     _write(axes, _LEFT_MM, 275.0, textwrap.fill(headline, 62), 10)
-    senses = sorted({mount.turn_raises_leg for mount in instrument.mounts.values()})
-    sense = "as the row says" if len(senses) > 1 else f"{senses[0]} raises the facet (towards the sky)"
-    lines = [
-        "Work from top to bottom of this sheet: this is from the lowest facet to the highest.",
-        "Left and right are as seen by a person who looks at the reflector from its focal point.",
-        f"Turning a bolt {sense}. Senses are those that you see at the bolt. Turn all bolts of a facet, then tick it.",
-        "On the map: black facets are on this sheet, white numbers are their ids.",
-    ]
+    is_behind = instrument.bolts_seen_from == "back"
+    axes.add_patch(Rectangle((_LEFT_MM, 229.0), 114.0, 28.0, fc="none", ec="black", lw=2.0))
+    where = "Seen from BEHIND the mirror" if is_behind else "Seen from the FRONT of the mirror"
+    _write(axes, _LEFT_MM + 3.0, 254.5, where, 15, weight="bold")
+    senses = sorted({mount.turn_raises_leg for mount in instrument.mounts.values() if mount.pitch_m_per_turn})
+    raises = (
+        f"{senses[0].capitalize()} raises the facet, to the sky." if len(senses) == 1 else "Senses differ: read each."
+    )
+    lines = ["Arrows: the way to turn, looking at the bolt.", raises]
     for line, text in enumerate(lines):
-        _write(axes, _LEFT_MM, 257.0 - 12.0 * line, textwrap.fill(text, 62), 9.0)
+        _write(axes, _LEFT_MM + 3.0, 245.0 - 8.0 * line, text, 11, weight="bold")
+    side = "stand behind the mirror and look at its back" if is_behind else "look at the mirror from its focal point"
+    lines = [
+        f"Left and right are yours when you {side}. Work from the top of the sheet down: the lowest facet comes first.",
+        "Turn all bolts of a facet, then tick it. Map: black facets are on this sheet.",
+    ]
+    _write(axes, _LEFT_MM, 226.0, "\n".join(textwrap.fill(line, 68) for line in lines), 8.5, linespacing=1.2)
 
 
 def _draw_key_map(page: Figure, outlines: Mapping[int, Array], sheet: Sheet) -> None:
@@ -155,14 +174,15 @@ def _draw_key_map(page: Figure, outlines: Mapping[int, Array], sheet: Sheet) -> 
     key_map.set_axis_off()
 
 
-def _draw_table(axes: Axes, mounts: Mapping[int, Mount], instructions: Sequence[FacetInstruction]) -> None:
+def _draw_table(axes: Axes, instrument: Instrument, instructions: Sequence[FacetInstruction]) -> None:
     """One row per facet, the lowest facet of the reflector first; those not to be turned in a box at the end."""
     to_do = [instruction for instruction in instructions if instruction.verdict is not Verdict.DO_NOT_TURN]
     forbidden = [instruction for instruction in instructions if instruction.verdict is Verdict.DO_NOT_TURN]
     row_mm = (_TABLE_TOP_MM - _TABLE_BOTTOM_MM) / (MOST_FACETS_PER_SHEET + 0.5)
     top_mm = _TABLE_TOP_MM
     for instruction in to_do:
-        _draw_row(axes, mounts[instruction.facet_id], instruction, top_mm, row_mm)
+        mount = instrument.mounts[instruction.facet_id]
+        _draw_row(axes, mount, _to_view(instrument.bolts_seen_from), instruction, top_mm, row_mm)
         top_mm -= row_mm
     if not forbidden:
         return
@@ -179,11 +199,13 @@ def _draw_table(axes: Axes, mounts: Mapping[int, Mount], instructions: Sequence[
         _write(axes, _LEFT_MM + 26.0, y_mm - 0.1 * row_mm, textwrap.fill(text, 92), 9)
 
 
-def _draw_row(axes: Axes, mount: Mount, instruction: FacetInstruction, top_mm: float, row_mm: float) -> None:
+def _draw_row(
+    axes: Axes, mount: Mount, to_view: Array, instruction: FacetInstruction, top_mm: float, row_mm: float
+) -> None:
     middle_mm = top_mm - 0.5 * row_mm
     axes.add_patch(Rectangle((_LEFT_MM, top_mm - row_mm), _RIGHT_MM - _LEFT_MM, row_mm, fc="none", ec="black", lw=0.8))
     _write(axes, _LEFT_MM + 12.0, middle_mm, str(instruction.facet_id), 24, weight="bold", ha="center", va="center")
-    _draw_arms(axes, mount, np.array([_LEFT_MM + 34.0, middle_mm]), 0.32 * row_mm)
+    _draw_arms(axes, mount.legs_m * to_view, np.array([_LEFT_MM + 32.0, middle_mm]), 0.32 * row_mm)
     notes = [_NOTE_OF_FLAG[flag] for flag in instruction.flags if flag in _NOTE_OF_FLAG]
     if instruction.verdict is Verdict.NO_BOLTS:
         _write(axes, _LEFT_MM + 50.0, middle_mm, "no bolts: its legs are driven", 13, va="center")
@@ -212,23 +234,37 @@ _NOTE_OF_FLAG = {
 
 
 def _draw_turn(axes: Axes, x_mm: float, y_mm: float, bolt: int, turn_deg: int, mount: Mount, scale: float) -> None:
-    """One bolt: its number in a circle, the size and the sense of the turn in words, whole turns apart."""
-    radius_mm = 3.4 * scale
-    axes.add_patch(Circle((x_mm + radius_mm, y_mm), radius_mm, fc="none", ec="black", lw=1.2))
+    """One bolt: its number, an arrow round it the way it is turned, and size and sense in words, whole turns apart."""
+    radius_mm = _ARROW_RADIUS_MM * scale
+    centre = np.array([x_mm + radius_mm, y_mm])
     _write(
-        axes, x_mm + radius_mm, y_mm - 0.1, str(bolt + 1), 11 * scale, weight="bold", ha="center", va="center_baseline"
+        axes, float(centre[0]), y_mm - 0.1, str(bolt + 1), 15 * scale, weight="bold", ha="center", va="center_baseline"
     )
-    x_mm += 2.0 * radius_mm + 1.5
+    x_mm += 2.0 * radius_mm + 2.8 * scale
     if turn_deg == 0:
+        axes.add_patch(Circle((float(centre[0]), y_mm), 0.8 * radius_mm, fc="none", ec="0.6", lw=1.0))
         _write(axes, x_mm, y_mm, "leave", 13 * scale, va="center")
         return
-    words = turn_in_words(abs(turn_deg))
-    size_pt = min(15.0, 120.0 / len(words)) * scale  # `12 turns + 345°` still fits beside the next bolt
-    _write(axes, x_mm, y_mm + 3.2 * scale, words, size_pt, weight="bold", va="center")
     other = {"clockwise": "counterclockwise", "counterclockwise": "clockwise"}
     sense = mount.turn_raises_leg if turn_deg > 0 else other[mount.turn_raises_leg]
-    arrow = {"clockwise": "↻", "counterclockwise": "↺"}[sense]
-    _write(axes, x_mm, y_mm - 3.6 * scale, f"{arrow} {sense}", 8.0 * scale, va="center")
+    _draw_round_arrow(axes, centre, radius_mm, is_clockwise=sense == "clockwise", scale=scale)
+    words = turn_in_words(abs(turn_deg))
+    size_pt = min(15.0, 112.0 / len(words)) * scale  # `12 turns + 345°` still fits beside the next bolt
+    _write(axes, x_mm, y_mm + 4.4 * scale, words, size_pt, weight="bold", va="center")
+    _write(axes, x_mm, y_mm + 0.9 * scale, sense.replace("counter", "counter-\n"), 9.5 * scale, linespacing=1.05)
+
+
+def _draw_round_arrow(axes: Axes, centre: Array, radius_mm: float, *, is_clockwise: bool, scale: float) -> None:
+    """Three quarters of a circle with a head; it begins and ends beside the top, where the gap is."""
+    angles = np.pi / 2.0 + (-1.0 if is_clockwise else 1.0) * np.radians(np.linspace(45.0, 300.0, 60))
+    arc = centre + radius_mm * np.column_stack([np.cos(angles), np.sin(angles)])
+    axes.plot(*arc.T, color="black", lw=2.6 * scale, solid_capstyle="butt")
+    along = arc[-1] - arc[-2]
+    along /= np.linalg.norm(along)
+    across = np.array([-along[1], along[0]])
+    head = 1.9 * scale
+    corners = [arc[-1] + 1.6 * head * along, arc[-1] + head * across, arc[-1] - head * across]
+    axes.add_patch(Polygon(np.array(corners), closed=True, fc="black", ec="none"))
 
 
 def turn_in_words(turn_deg: int) -> str:
@@ -238,11 +274,11 @@ def turn_in_words(turn_deg: int) -> str:
     return " + ".join(part for part in (turns, f"{rest_deg}°" if rest_deg or not whole else "") if part)
 
 
-def _draw_arms(axes: Axes, mount: Mount, centre_mm: Array, size_mm: float) -> None:
-    """Where the bolts are, seen from the focal point."""
-    reach_m = float(np.linalg.norm(mount.legs_m, axis=1).max())
-    for bolt, leg_m in enumerate(mount.legs_m):
+def _draw_arms(axes: Axes, legs_m: Array, centre_mm: Array, size_mm: float) -> None:
+    """Where the bolts are, as the person who turns them sees it; `legs_m` to the right and up."""
+    reach_m = float(np.linalg.norm(legs_m, axis=1).max())
+    for bolt, leg_m in enumerate(legs_m):
         end = centre_mm + size_mm * leg_m / reach_m
         axes.plot(*np.array([centre_mm, end]).T, color="black", lw=0.9)
-        axes.add_patch(Circle((float(end[0]), float(end[1])), 1.9, fc="white", ec="black", lw=0.8, zorder=3))
-        _write(axes, float(end[0]), float(end[1]) - 0.1, str(bolt + 1), 7, ha="center", va="center_baseline")
+        axes.add_patch(Circle((float(end[0]), float(end[1])), 2.3, fc="white", ec="black", lw=0.8, zorder=3))
+        _write(axes, float(end[0]), float(end[1]) - 0.1, str(bolt + 1), 9, ha="center", va="center_baseline")

@@ -1,7 +1,8 @@
 """instructions.png: the bolt turns drawn on the picture of the reflector.
 
 Reads like the instruction graphic of arXiv:1605.06274: facet outlines and ids in red, the arms of the mounts and
-the numbers of their bolts in green, the turns in yellow.
+the numbers of their bolts in green, the turns in yellow. Under red light these are all one colour: there ids stand in
+frames, bolts are bright discs with black numbers, and only turns are bare numbers.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ Image = NDArray[np.uint8]
 
 PNG_FILE = "instructions.png"
 
-_RED, _ID_RED, _GREEN, _YELLOW, _WHITE = "#ff2020", "#ff8080", "#50ff78", "#ffe600", "#ffffff"
+_RED, _ID_RED, _GREEN, _YELLOW, _WHITE = "#ff2020", "#ff8080", "#b4ffb4", "#ffe600", "#ffffff"
 _BOLD = FontProperties(family="DejaVu Sans", weight="bold")  # ships with matplotlib: the same on every machine
 _DPI = 72  # one point of text is one pixel
 
@@ -143,7 +144,16 @@ def _text_size_em(text: str) -> tuple[float, float]:
     return float(extents.width) + 0.25, 1.2  # with the outline of the letters
 
 
-def _write(axes: Axes, centre: Array, text: str, size_px: float, colour: str) -> None:
+def _write(
+    axes: Axes,
+    centre: Array,
+    text: str,
+    size_px: float,
+    colour: str,
+    *,
+    outline: str = "black",
+    frame: dict[str, str | float] | None = None,
+) -> None:
     axes.text(
         centre[0],
         centre[1],
@@ -153,7 +163,8 @@ def _write(axes: Axes, centre: Array, text: str, size_px: float, colour: str) ->
         fontproperties=_BOLD,
         ha="center",
         va="center_baseline",
-        path_effects=[withStroke(linewidth=max(2.0, 0.16 * size_px), foreground="black")],
+        path_effects=[withStroke(linewidth=max(2.0, 0.16 * size_px), foreground=outline)],
+        bbox=frame,
     )
 
 
@@ -204,8 +215,8 @@ def _draw_turns(axes: Axes, facet: FacetInPicture, instruction: FacetInstruction
     axes.add_collection(LineCollection(arms, colors="black", linewidths=2.0 * line_px))
     axes.add_collection(LineCollection(arms, colors=_GREEN, linewidths=line_px))
     for bolt, end in enumerate(ends):
-        axes.add_patch(Circle((end[0], end[1]), _BOLT_RADIUS * width_px, fc="black", ec=_GREEN, lw=line_px, zorder=3))
-        _write(axes, end, str(bolt + 1), _BOLT_SIZE * width_px, _GREEN)
+        axes.add_patch(Circle((end[0], end[1]), _BOLT_RADIUS * width_px, fc=_GREEN, ec="black", lw=line_px, zorder=3))
+        _write(axes, end, str(bolt + 1), 1.15 * _BOLT_SIZE * width_px, "black", outline=_GREEN)
 
     turns = [f"{turn_deg:+d}°".replace("-", "−") for turn_deg in instruction.turns_deg]
     for shrink in (1.0, 0.9, 0.8, 0.7, 0.6, 0.5):
@@ -214,7 +225,14 @@ def _draw_turns(axes: Axes, facet: FacetInPicture, instruction: FacetInstruction
             turn_centres, id_centre = placed
             for text, centre in zip(turns, turn_centres, strict=True):
                 _write(axes, centre, text, shrink * _TURN_SIZE * width_px, _YELLOW)
-            _write(axes, id_centre, str(facet.facet_id), shrink * _ID_SIZE * width_px, _ID_RED)
+            id_px = shrink * _ID_SIZE * width_px
+            frame: dict[str, str | float] = {
+                "boxstyle": "round,pad=0.12",
+                "fc": "black",
+                "ec": _ID_RED,
+                "lw": max(1.0, 0.008 * width_px),
+            }
+            _write(axes, id_centre, str(facet.facet_id), 0.9 * id_px, _ID_RED, frame=frame)
             return
     _write(axes, facet.centre_px, f"{facet.facet_id}: see the list", 0.09 * width_px, _ID_RED)
 
@@ -275,7 +293,7 @@ def _legend_lines(
         explanation = "This telescope has no bolts: its legs are driven, see leg_travel_m in alignment.json."
     elif is_legible:
         explanation = (
-            f"Turn the bolt (green number) by the yellow degrees, {sense}.   "
+            f"Turn the bolt (number in a disc) by the degrees beside it, {sense}.   Framed: facet.   "
             "ok: no turn needed.   White broken frame: do not turn."
         )
     else:
@@ -283,7 +301,12 @@ def _legend_lines(
             "Facets are too small in this picture for numbers: read them in instructions.pdf or instructions.csv.   "
             "White broken frame: do not turn."
         )
-    return [headline, explanation]
+    side = (
+        "Seen from the focal point: behind the mirror left and right are exchanged."
+        if instrument.bolts_seen_from == "back"
+        else "Seen from the focal point."
+    )
+    return [headline, f"{explanation}   {side}"]
 
 
 def _draw_legend(figure: Figure, size: tuple[int, int], legend_px: int, lines: Sequence[str]) -> None:

@@ -20,6 +20,7 @@ from namod_ctl.app.build_twin import load_twin_settings
 from namod_ctl.app.build_twin_campaign import open_twin_campaign
 from namod_ctl.app.campaign_report import write_campaign_report
 from namod_ctl.app.config import InstrumentConfig, load_config
+from namod_ctl.app.dashboard.beside import dashboard_beside
 from namod_ctl.app.twin_note import note_twin, noted_twin
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.errors import ConfigError
@@ -80,6 +81,9 @@ def align(
     twin_settings: Annotated[
         Path | None, typer.Option("--twin-settings", metavar="FILE", help="Faults and sky of the twin, a TOML file.")
     ] = None,
+    dashboard: Annotated[
+        bool, typer.Option("--dashboard", help="Serve the live page on this computer meanwhile, and print its address.")
+    ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace an older campaign at --out, at once.")] = False,
 ) -> None:
     """Align the telescope: record, reconstruct and correct until the point spread function has converged.
@@ -105,6 +109,10 @@ def align(
             open_twin_campaign(store, start.config, start.settings, start.seed, wishes, SystemClock(), switch, view)
         )
         twin = opened.twin
+        if dashboard:
+            console.print(
+                f"live page: {stack.enter_context(dashboard_beside(store.path))}", soft_wrap=True, markup=False
+            )
         with _stopped_by_sigterm():
             try:
                 state = opened.campaign.run()

@@ -137,6 +137,17 @@ def _counts(instructions: tuple[FacetInstruction, ...]) -> str:
     return ", ".join(f"{counted[verdict]} {text}" for verdict, text in words.items() if counted[verdict])
 
 
+def _forbidden(instructions: tuple[FacetInstruction, ...]) -> dict[str, list[int]]:
+    """Facets that nobody should turn, by what stands against it; what is said of one facet alone comes after that."""
+    groups: dict[str, list[int]] = {}
+    for instruction in instructions:
+        if instruction.verdict is Verdict.DO_NOT_TURN:
+            repeated = f"facet {instruction.facet_id}: do not turn: "
+            reasons = dict.fromkeys(reason.removeprefix(repeated) for reason in instruction.reasons)
+            groups.setdefault("; ".join(reasons) or "no reliable estimate", []).append(instruction.facet_id)
+    return groups
+
+
 def _headline(alignment: Alignment, run: str, instructions: tuple[FacetInstruction, ...]) -> str:
     headline = (
         f"{alignment.telescope}, run {run}: {len(instructions)} facets, {_counts(instructions)} "
@@ -156,9 +167,9 @@ def _report(alignment: Alignment, instructions: tuple[FacetInstruction, ...], fo
     typer.echo(f"{len(instructions)} facets: {_counts(instructions)}.")
     if instructions and all(instruction.verdict is Verdict.NO_BOLTS for instruction in instructions):
         typer.echo("This telescope has no bolts: its legs are driven; their travels are in alignment.json.")
-    for instruction in instructions:
-        if instruction.verdict is Verdict.DO_NOT_TURN:
-            typer.echo(f"Facet {instruction.facet_id}: do not turn: {'; '.join(instruction.reasons)}.")
+    for reasons, facet_ids in _forbidden(instructions).items():
+        ids = ", ".join(map(str, facet_ids))
+        typer.echo(f"Do not turn facet{'s' if len(facet_ids) > 1 else ''} {ids}: {reasons}.")
     if doubtful := _resting_on_bad_records(alignment):
         typer.echo(
             f"Estimator {alignment.estimator} does not leave out bad records: the turns of facets {doubtful} rest "

@@ -20,6 +20,7 @@ from namod_ctl.app.build import build_instrument
 from namod_ctl.app.build_recording import build_record_settings
 from namod_ctl.app.build_twin import build_twin, load_twin_settings, with_facet_map
 from namod_ctl.app.config import InstrumentConfig, load_config
+from namod_ctl.app.dashboard.beside import dashboard_beside
 from namod_ctl.app.terminal import TerminalView
 from namod_ctl.app.twin_note import different_sections, note_twin, noted_twin
 from namod_ctl.core.clock import SystemClock
@@ -103,6 +104,9 @@ def record(
             help="Sky, telescope, cameras and faults of the twin: a TOML file such as config/twin/rough_night.toml.",
         ),
     ] = None,
+    dashboard: Annotated[
+        bool, typer.Option("--dashboard", help="Serve the live page on this computer meanwhile, and print its address.")
+    ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace an older run at --out, at once.")] = False,
 ) -> None:
     """Record image pairs of a star and of the reflector into a run.
@@ -143,6 +147,9 @@ def record(
             estimator = LiveEstimator(session.store.path, session.instrument, is_waited_for=True)  # a twin can
             stack.callback(estimator.close)
         recorder = Recorder(session.equipment, session.instrument, session.store, settings, estimator, session.replayed)
+        if dashboard:
+            address = stack.enter_context(dashboard_beside(session.store.path))
+            console.print(f"live page: {address}", soft_wrap=True, markup=False)
         with TerminalView(console, title) as view, _stopped_by_ctrl_c(recorder, console):
             reason = recorder.record(stop, view.show)
             progress = recorder.progress()

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 import shutil
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,7 +23,13 @@ from output_samples import (
     unknown_facet,
 )
 
-from namod_ctl.app.instruction_sheets import MOST_FACETS_PER_SHEET, plan_sheets, sheets_to_pdf, turn_in_words
+from namod_ctl.app.instruction_sheets import (
+    MOST_FACETS_PER_SHEET,
+    _pages,
+    plan_sheets,
+    sheets_to_pdf,
+    turn_in_words,
+)
 from namod_ctl.app.instructions import Verdict, facet_instructions, instructions_to_csv
 from namod_ctl.core.flags import FacetFlag
 from namod_ctl.core.units import deg_to_rad, rad_to_deg
@@ -114,7 +122,7 @@ def text_of(pdf, tmp_path):
         pytest.skip("pdftotext (poppler-utils) is not installed")
     (tmp_path / "sheets.pdf").write_bytes(pdf)
     return subprocess.run(
-        ["pdftotext", "-layout", "sheets.pdf", "-"], cwd=tmp_path, check=True, capture_output=True, text=True
+        ["pdftotext", "sheets.pdf", "-"], cwd=tmp_path, check=True, capture_output=True, text=True
     ).stdout
 
 
@@ -133,7 +141,10 @@ def test_sheets_say_the_sense_of_every_turn(tmp_path):
     assert "DO NOT TURN" in text
     assert "record 17" in text
     assert "no turn needed" in text
-    assert text.index(" clockwise") < text.index("counterclockwise")  # bolt 1 up, bolts 2 and 3 down
+    pages = list(_pages(instrument, facet_instructions(alignment, TEN_DEG), "headline"))
+    words = [t.get_text().replace("-\n", "") for page in pages for t in page.axes[0].texts]
+    senses = [word for word in words if word in ("clockwise", "counterclockwise")]
+    assert senses == ["clockwise", "counterclockwise", "counterclockwise"]  # bolt 1 up, bolts 2 and 3 down
 
 
 def test_a_telescope_without_bolts_gets_one_page_that_says_so(tmp_path):
@@ -150,3 +161,31 @@ def test_sheets_of_a_large_telescope():
     reflector = honeycomb(198, 1.51, 28.0)
     instructions = facet_instructions(random_alignment(reflector), TEN_DEG)
     assert sheets_to_pdf(instrument_of(reflector, {}), instructions, "headline").startswith(b"%PDF")
+
+
+def test_sheets_are_drawn_from_behind_unless_the_config_says_otherwise(tmp_path):
+    reflector = honeycomb(29, 0.606, 4.889)
+    places = {facet.id: facet.position_m[0] for facet in reflector.facets}
+    behind = plan_sheets(reflector, reflector.ids, "back")
+    leftmost = {place: [i for sheet in behind if sheet.place == place for i in sheet.facet_ids] for place in (1,)}[1]
+    assert min(places[i] for i in leftmost) > max(places.values()) - 0.606  # +x is at the left hand
+    instructions = facet_instructions(alignment_of([facet_alignment(i) for i in reflector.ids]), TEN_DEG)
+    instrument = instrument_of(reflector, {})
+    texts = {}
+    for side in ("back", "front"):
+        texts[side] = text_of(sheets_to_pdf(replace(instrument, bolts_seen_from=side), instructions, "h"), tmp_path)
+    assert "BEHIND" in texts["back"]
+    assert "BEHIND" not in texts["front"]
+    # the numbers are the same: one sheet holds the same turns per facet, whoever looks
+    assert sorted(re.findall(r"\d+°", texts["back"])) == sorted(re.findall(r"\d+°", texts["front"]))
+
+
+@pytest.mark.parametrize("side", ["front", "back"])
+def test_bolts_are_where_the_person_sees_them(side):
+    """Bolt 1 of a tripod is at telescope +x: right as seen from the focal point, left from behind."""
+    reflector = honeycomb(1, 0.606, 4.889)
+    instrument = replace(instrument_of(reflector, {}), bolts_seen_from=side)
+    instructions = facet_instructions(alignment_of([facet_alignment(1, (0.1, 0.0))]), TEN_DEG)
+    (page,) = _pages(instrument, instructions, "headline")
+    x_of_numbers = {t.get_text(): t.get_position()[0] for t in page.axes[0].texts if t.get_fontsize() == 9}
+    assert (x_of_numbers["1"] > x_of_numbers["2"]) == (side == "front")

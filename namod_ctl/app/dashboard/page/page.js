@@ -1,0 +1,100 @@
+// The page: sections arrive as server-sent events, each goes to the module that draws it.
+
+import { showActuators, showJournal } from "./campaign.js";
+import { setUpCommands, showCommands, showTurns } from "./commands.js";
+import { showCoverage } from "./coverage.js";
+import { showCycles } from "./cycles.js";
+import { byId, isNight, nextMessage, setText } from "./dom.js";
+import { refreshFacet, setUpFacet, showFacetDetails } from "./facet.js";
+import { setUpMirror, showFacets, showMirrorPicture } from "./mirror.js";
+import { showPsf } from "./psf.js";
+import { setClock, showRecords } from "./records.js";
+import { setUpStar, showStar } from "./star.js";
+
+const known = {};
+
+const draw = {
+  clock: setClock,
+  about(about) {
+    setText(byId("title"), `${about.telescope}: ${about.name}`);
+    document.title = `${about.telescope} ${about.name}`;
+    setText(byId("about"), `${about.source}. namod-ctl ${about.version}.`);
+    setUpMirror(about);
+    setUpFacet(about);
+    setUpStar(about);
+    setUpCommands(about);
+  },
+  standing(standing) {
+    const before = byId("state").textContent;
+    const state = standing.state.replaceAll("_", " ") + (standing.kind === "campaign" && !standing.is_running ? " (nobody at work)" : "");
+    setText(byId("state"), state);
+    setText(byId("meaning"), standing.meaning);
+    setText(byId("reason"), standing.reason ? `Because: ${standing.reason}` : "");
+    setText(byId("next"), standing.next);
+    if (state !== before) nextMessage(byId("spoken"), `${state}. Next: ${standing.next}`);
+    showCommands(standing);
+    showTurns(standing);
+    showFacetDetails(known);
+  },
+  now(now) {
+    showRecords(now);
+    showCoverage(now);
+    showStar(now);
+    showMirrorPicture(now);
+    refreshFacet(known);
+  },
+  facets(facets) {
+    showFacets(facets);
+    showFacetDetails(known);
+  },
+  psf: showPsf,
+  cycles: showCycles,
+  actuators(actuators) {
+    showActuators(actuators);
+    showFacetDetails(known);
+  },
+  journal: showJournal,
+  trouble(text) {
+    showBanner(text);
+  },
+};
+
+function receive(name, text) {
+  known[name] = JSON.parse(text);
+  draw[name](known[name]);
+  document.documentElement.dataset.updated = String(performance.now());
+}
+
+function showBanner(text) {
+  byId("banner").hidden = !text;
+  setText(byId("banner"), text);
+}
+
+function listen() {
+  const source = new EventSource("/events");
+  for (const name of Object.keys(draw)) source.addEventListener(name, (event) => receive(name, event.data));
+  source.onopen = () => showBanner("");
+  source.onerror = () => {
+    showBanner("No connection to the page's program: what stands here is old. Trying again.");
+    if (source.readyState === EventSource.CLOSED) setTimeout(listen, 2000);
+  };
+}
+
+function setUpMode() {
+  const button = byId("mode");
+  const show = () => button.setAttribute("aria-pressed", String(isNight()));
+  show();
+  button.addEventListener("click", () => {
+    document.documentElement.dataset.mode = isNight() ? "day" : "night";
+    try {
+      localStorage.setItem("namod-mode", document.documentElement.dataset.mode);
+    } catch {
+      // without storage it holds for this page
+    }
+    show();
+    for (const [name, value] of Object.entries(known)) if (!["about", "standing", "clock"].includes(name)) draw[name](value);
+  });
+}
+
+setUpMode();
+listen();

@@ -1,0 +1,46 @@
+// One camera's last kept frame. A new one is fetched when the one before has come, and not more often than eyes need.
+
+const EVERY_MS = 700;
+
+export class Picture {
+  constructor(image, camera) {
+    this.image = image;
+    this.camera = camera;
+    this.isKept = false;
+    this.wanted = "";
+    this.begun = -Infinity;
+    this.timer = 0;
+    this.isBusy = false;
+    image.addEventListener("load", () => { image.hidden = false; this.done(); });
+    image.addEventListener("error", () => this.done());
+  }
+
+  show(now) {
+    const index = now.frames[this.camera];
+    this.isKept = index !== undefined;
+    if (!this.isKept) {
+      this.image.hidden = true;
+      return;
+    }
+    this.wanted = `/frame/${now.run}/${this.camera}/${index}`;
+    this.fetch();
+  }
+
+  fetch() {
+    if (this.isBusy || this.timer || this.wanted === this.fetched) return;
+    const wait = this.begun + EVERY_MS - performance.now();
+    if (wait > 0) {
+      this.timer = setTimeout(() => { this.timer = 0; this.fetch(); }, wait);
+      return;
+    }
+    this.isBusy = true;
+    this.begun = performance.now();
+    this.fetched = this.wanted;
+    this.image.src = this.wanted;
+  }
+
+  done() {
+    this.isBusy = false;
+    this.fetch();
+  }
+}
