@@ -26,6 +26,7 @@ from namod_ctl.imaging.radiometry import (
     saturation_adu,
 )
 from namod_ctl.optics.camera_model import CameraModel
+from namod_ctl.optics.polygons import crossing_sides
 
 MAX_GROUP_PIXELS = 20_000
 """Pixels, of three colours, whose table entries fill half a megabyte."""
@@ -195,7 +196,7 @@ def pixels_of_polygon(polygon_px: Array, n_columns: int, n_rows: int, name: str)
             f"{name}: the corner x = {x:g}, y = {y:g} of its polygon lies outside the image of "
             f"{n_columns} x {n_rows} pixel: correct the polygon or the size of the image"
         )
-    crossing = _self_crossing(corners)
+    crossing = crossing_sides(corners)
     if crossing is not None:
         raise ConfigError(
             f"{name}: its polygon crosses or touches itself (sides {crossing[0] + 1} and {crossing[1] + 1}): "
@@ -215,28 +216,3 @@ def pixels_of_polygon(polygon_px: Array, n_columns: int, n_rows: int, name: str)
         raise ConfigError(f"{name}: its polygon holds no pixel at all: draw it larger, or leave this facet out")
     pixels: NDArray[np.intp] = (rows + top) * n_columns + columns + left
     return pixels
-
-
-def _self_crossing(corners: Array) -> tuple[int, int] | None:
-    """Two sides that have a point in common other than the corner of neighbours, or None."""
-    start, end = corners, np.roll(corners, -1, axis=0)
-    n = len(corners)
-    first, second = np.triu_indices(n, k=1)
-    is_neighbour = (second - first == 1) | (second - first == n - 1)
-    a, b, c, d = start[first], end[first], start[second], end[second]
-    is_common = (_turn(a, b, c) * _turn(a, b, d) <= 0) & (_turn(c, d, a) * _turn(c, d, b) <= 0)
-    overlap = (np.minimum(np.maximum(a, b), np.maximum(c, d)) - np.maximum(np.minimum(a, b), np.minimum(c, d))).min(
-        axis=1
-    )
-    is_crossing = is_common & (overlap >= 0) & ~is_neighbour
-    # Neighbours always share a corner: they cross when one folds back onto the other, or has no length.
-    ahead, back = b - a, d - c
-    is_folded = (ahead[:, 0] * back[:, 1] == ahead[:, 1] * back[:, 0]) & ((ahead * back).sum(axis=1) <= 0)
-    found = np.flatnonzero(is_crossing | (is_neighbour & is_folded))
-    return (int(first[found[0]]), int(second[found[0]])) if found.size else None
-
-
-def _turn(a: Array, b: Array, c: Array) -> Array:
-    """Sign of the turn from a over b to c; 0 on one line."""
-    turn: Array = np.sign((b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0]))
-    return turn

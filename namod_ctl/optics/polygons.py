@@ -1,13 +1,20 @@
-"""Outlines of facets in an image: is a polygon one that pixels can be counted in?"""
+"""Outlines of facets in an image: is a polygon one that pixels can be counted in, and do they go together?"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
 MIN_AREA_PX2 = 1.0
+MAX_OVERLAP_SHARE = 0.05
+"""Of the smaller polygon's area: hand-drawn and projected outlines of touching facets share a little."""
+
+_SUBPIXELS = 4  # per pixel and axis, for the common area of polygons that are not convex
 
 
 def polygon_fault(corners_px: Array, n_columns: int, n_rows: int) -> str | None:
@@ -25,66 +32,131 @@ def polygon_fault(corners_px: Array, n_columns: int, n_rows: int) -> str | None:
                 f"corner {number} at ({x_px:g}, {y_px:g}) px lies outside the image of {n_columns} x {n_rows} pixels; "
                 "give corners as (column, row) of this camera's full image"
             )
-    crossing = _first_crossing(corners_px)
+    crossing = crossing_sides(corners_px)
     if crossing is not None:
         first, second = crossing
         return (
             f"crosses itself: the side from corner {first + 1} meets the side from corner {second + 1}; "
             "list the corners in order along the outline, each once"
         )
-    x_px, y_px = corners_px[:, 0], corners_px[:, 1]
-    area_px2 = abs(float(np.sum(x_px * np.roll(y_px, -1) - np.roll(x_px, -1) * y_px))) / 2.0
+    area_px2 = polygon_area_px2(corners_px)
     if area_px2 < MIN_AREA_PX2:
         return f"covers {area_px2:g} square pixels; it needs at least {MIN_AREA_PX2:g}"
     return None
 
 
-def _first_crossing(corners_px: Array) -> tuple[int, int] | None:
-    """Two sides of the outline, by the index of their first corner, that meet other than in a shared corner."""
-    n_corners = len(corners_px)
-    for first in range(n_corners):
-        if _folds_back(corners_px[first - 1], corners_px[first], corners_px[(first + 1) % n_corners]):
-            return (first - 1) % n_corners, first
-        for second in range(first + 1, n_corners):
-            is_neighbour = second == first + 1 or (first == 0 and second == n_corners - 1)
-            if is_neighbour:
-                continue
-            if _sides_meet(
-                corners_px[first],
-                corners_px[(first + 1) % n_corners],
-                corners_px[second],
-                corners_px[(second + 1) % n_corners],
-            ):
-                return first, second
-    return None
+def polygon_area_px2(corners_px: Array) -> float:
+    """Area of an outline of shape (n_corners, 2) (the shoelace rule)."""
+    x, y = (corners_px - corners_px[0]).T
+    return abs(float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))) / 2.0
 
 
-def _side_of(start: Array, end: Array, point: Array) -> float:
-    """Positive if `point` lies to one side of the line from `start` to `end`, negative on the other, 0 on it."""
-    along, to_point = end - start, point - start
-    return float(along[0] * to_point[1] - along[1] * to_point[0])
+def polygon_centre_px(corners_px: Array) -> Array:
+    """Centre of gravity, shape (2,), of the area in an outline of shape (n_corners, 2)."""
+    x, y = (corners_px - corners_px[0]).T
+    cross = x * np.roll(y, -1) - np.roll(x, -1) * y
+    sums = np.array([((x + np.roll(x, -1)) * cross).sum(), ((y + np.roll(y, -1)) * cross).sum()])
+    centre: Array = corners_px[0] + sums / (3.0 * cross.sum())
+    return centre
 
 
-def _folds_back(before: Array, corner: Array, after: Array) -> bool:
-    """Does the side that leaves `corner` run back over the one that arrives, or has one of them no length?"""
-    arriving, leaving = corner - before, after - corner
-    return _side_of(before, corner, after) == 0 and float(arriving @ leaving) <= 0
+def crossing_sides(corners_px: Array) -> tuple[int, int] | None:
+    """Two sides, by the index of their first corner, that meet other than in the corner of neighbours, or None.
 
-
-def _is_within(start: Array, end: Array, point: Array) -> bool:
-    """For a point on the line through `start` and `end`: does it lie between them?"""
-    return bool((np.minimum(start, end) <= point).all() and (point <= np.maximum(start, end)).all())
-
-
-def _sides_meet(a: Array, b: Array, c: Array, d: Array) -> bool:
-    """Do the segments a-b and c-d share a point?"""
-    side_c, side_d = _side_of(a, b, c), _side_of(a, b, d)
-    side_a, side_b = _side_of(c, d, a), _side_of(c, d, b)
-    if side_c * side_d < 0 and side_a * side_b < 0:
-        return True
-    return (
-        (side_c == 0 and _is_within(a, b, c))
-        or (side_d == 0 and _is_within(a, b, d))
-        or (side_a == 0 and _is_within(c, d, a))
-        or (side_b == 0 and _is_within(c, d, b))
+    Neighbours that fold back onto each other, and a side without length, count. Shape (n_corners, 2), n_corners >= 3.
+    """
+    start, end = corners_px, np.roll(corners_px, -1, axis=0)
+    n = len(corners_px)
+    first, second = np.triu_indices(n, k=1)
+    is_neighbour = (second - first == 1) | (second - first == n - 1)
+    a, b, c, d = start[first], end[first], start[second], end[second]
+    is_common = (_turn(a, b, c) * _turn(a, b, d) <= 0) & (_turn(c, d, a) * _turn(c, d, b) <= 0)
+    overlap = (np.minimum(np.maximum(a, b), np.maximum(c, d)) - np.maximum(np.minimum(a, b), np.minimum(c, d))).min(
+        axis=1
     )
+    is_crossing = is_common & (overlap >= 0) & ~is_neighbour
+    # Neighbours always share a corner: they cross when one folds back onto the other, or has no length.
+    ahead, back = b - a, d - c
+    is_folded = (ahead[:, 0] * back[:, 1] == ahead[:, 1] * back[:, 0]) & ((ahead * back).sum(axis=1) <= 0)
+    found = np.flatnonzero(is_crossing | (is_neighbour & is_folded))
+    return (int(first[found[0]]), int(second[found[0]])) if found.size else None
+
+
+def _turn(a: Array, b: Array, c: Array) -> Array:
+    """Sign of the turn from a over b to c; 0 on one line."""
+    turn: Array = np.sign((b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0]))
+    return turn
+
+
+def overlapping_polygons(polygons_px: Mapping[int, Array]) -> list[tuple[int, int, float]]:
+    """Pairs of sound polygons that cover each other: (id, id, share of the smaller one's area), largest share first."""
+    ids = list(polygons_px)
+    if not ids:
+        return []
+    low = np.array([polygons_px[i].min(axis=0) for i in ids])
+    high = np.array([polygons_px[i].max(axis=0) for i in ids])
+    is_near = (low[:, None] < high[None]).all(axis=2) & (low[None] < high[:, None]).all(axis=2)
+    pairs = []
+    for first, second in zip(*np.nonzero(np.triu(is_near, k=1)), strict=True):
+        one, other = polygons_px[ids[first]], polygons_px[ids[second]]
+        share = _common_area_px2(one, other) / min(polygon_area_px2(one), polygon_area_px2(other))
+        if share > 0.0:
+            pairs.append((ids[first], ids[second], share))
+    return sorted(pairs, key=lambda pair: -pair[2])
+
+
+def _common_area_px2(one: Array, other: Array) -> float:
+    origin = np.minimum(one.min(axis=0), other.min(axis=0))
+    a, b = (one - origin).astype(np.float32), (other - origin).astype(np.float32)
+    if cv2.isContourConvex(a) and cv2.isContourConvex(b):
+        return float(cv2.intersectConvexConvex(a, b)[0])
+    width, height = np.ceil(np.maximum(a.max(axis=0), b.max(axis=0)) * _SUBPIXELS).astype(int) + 1
+    masks = []
+    for corners in (a, b):
+        mask = np.zeros((height, width), dtype=np.uint8)
+        cv2.fillPoly(mask, [np.rint(corners * _SUBPIXELS).astype(np.int32)], 1)
+        masks.append(mask)
+    return float(np.count_nonzero(masks[0] & masks[1])) / _SUBPIXELS**2
+
+
+def clip_to_image(corners_px: Array, n_columns: int, n_rows: int) -> Array:
+    """The part of a convex polygon that lies in the image, shape (n, 2); (0, 2) if none does.
+
+    Source: Sutherland and Hodgman 1974, https://doi.org/10.1145/360767.360802.
+    """
+    clipped = np.asarray(corners_px, dtype=np.float64)
+    for axis, limit, sign in ((0, -0.5, 1.0), (0, n_columns - 0.5, -1.0), (1, -0.5, 1.0), (1, n_rows - 0.5, -1.0)):
+        inside = sign * (clipped[:, axis] - limit)
+        kept: list[Array] = []
+        for k in range(len(clipped)):
+            before = k - 1
+            if (inside[k] >= 0.0) != (inside[before] >= 0.0):
+                share = inside[before] / (inside[before] - inside[k])
+                entry = clipped[before] + share * (clipped[k] - clipped[before])
+                entry[axis] = limit
+                kept.append(entry)
+            if inside[k] >= 0.0:
+                kept.append(clipped[k])
+        clipped = np.array(kept).reshape(-1, 2)
+    return clipped
+
+
+def map_faults(polygons_px: Mapping[int, Array], n_columns: int, n_rows: int) -> dict[int, list[str]]:
+    """What is wrong with the outlines of a reflector, by facet id, for a person; empty if all are sound.
+
+    Missing facets are no fault here: one may be dismounted.
+    """
+    faults: dict[int, list[str]] = {}
+    for facet_id, corners_px in polygons_px.items():
+        fault = polygon_fault(corners_px, n_columns, n_rows)
+        if fault is not None:
+            faults[facet_id] = [fault]
+    sound = {facet_id: corners for facet_id, corners in polygons_px.items() if facet_id not in faults}
+    for first, second, share in overlapping_polygons(sound):
+        if share > MAX_OVERLAP_SHARE:
+            for facet_id, other in ((first, second), (second, first)):
+                faults.setdefault(facet_id, []).append(
+                    f"overlaps with facet {other} by {share:.0%} of the smaller one, at most {MAX_OVERLAP_SHARE:.0%} "
+                    "pass: move one of them"
+                )
+    return faults

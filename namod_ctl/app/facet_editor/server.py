@@ -1,0 +1,201 @@
+"""The facet map editor: a page for one person on this computer.
+
+Bound to 127.0.0.1. Whatever a web site of another origin might try, it can neither read nor write: the Host header must
+be this page's own, and every POST needs the page's origin and the token that is printed at start.
+"""
+
+from __future__ import annotations
+
+import hmac
+import secrets
+import socket
+from collections.abc import Callable
+from contextlib import suppress
+from datetime import date
+from importlib.resources import files
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import JSONResponse, PlainTextResponse, Response
+from starlette.routing import Route
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from namod_ctl.app.facet_editor.messages import (
+    Drawing,
+    Marks,
+    check_to_json,
+    facets_to_json,
+    map_to_json,
+    points_by_id,
+    read_message,
+)
+from namod_ctl.app.facet_editor.workbench import Workbench, png_of
+from namod_ctl.core.errors import ConfigError
+from namod_ctl.optics.facet_marks import MarksError
+
+TOKEN_HEADER = "x-namod-token"
+MAX_BODY_BYTES = 4_000_000
+"""A map of 1000 round facets with 48 corners each is 1 MB."""
+PAGE_FILES = {
+    "editor.html": "text/html; charset=utf-8",
+    "editor.css": "text/css; charset=utf-8",
+    "editor.js": "text/javascript; charset=utf-8",
+    "board.js": "text/javascript; charset=utf-8",
+    "model.js": "text/javascript; charset=utf-8",
+    "server.js": "text/javascript; charset=utf-8",
+    "icon.svg": "image/svg+xml",
+}
+HEADERS = {
+    "content-security-policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
+        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cross-origin-resource-policy": "same-origin",
+    "cache-control": "no-store",
+}
+
+
+class Guard:
+    """Refuses requests that are not of this page, and puts the headers that browsers obey on every answer."""
+
+    def __init__(self, app: ASGIApp, host: str, token: str) -> None:
+        self._app, self._host, self._token = app, host, token
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+
+        async def send_guarded(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                MutableHeaders(scope=message).update(HEADERS)
+            await send(message)
+
+        refused = self._refusal(scope["method"], Headers(scope=scope))
+        app: ASGIApp = self._app if refused is None else PlainTextResponse(refused[1], refused[0])
+        await app(scope, receive, send_guarded)
+
+    def _refusal(self, method: str, headers: Headers) -> tuple[int, str] | None:
+        if headers.getlist("host") != [self._host]:
+            return 421, "this page does not go by that name; use the address that was printed at start"
+        if method in ("GET", "HEAD"):
+            return None
+        if headers.getlist("origin") != [f"http://{self._host}"]:
+            return 403, "only this page itself may send"
+        if not hmac.compare_digest(headers.get(TOKEN_HEADER, "").encode(), self._token.encode()):
+            return 401, "the token is missing or wrong; open the whole address that was printed at start"
+        if not headers.get("content-length", "").isdigit() or int(headers["content-length"]) > MAX_BODY_BYTES:
+            return 413, f"at most {MAX_BODY_BYTES} bytes"
+        return None
+
+
+def build_app(bench: Workbench, host: str, token: str) -> Starlette:
+    """The editor as an ASGI application that goes by `host` (with port)."""
+    folder = files("namod_ctl.app.facet_editor")
+    served = {name: (folder / name).read_bytes() for name in PAGE_FILES}
+    picture = png_of(bench.image)
+    made = {"hand": "drawn by hand"}  # how the outlines came about, by what the page says it shows
+
+    async def page(request: Request) -> Response:
+        name = request.path_params.get("name", "editor.html")
+        if name not in served:
+            return PlainTextResponse("there is nothing here", 404)
+        return Response(served[name], media_type=PAGE_FILES[name])
+
+    async def image(_: Request) -> Response:
+        return Response(picture, media_type="image/png")
+
+    async def first(_: Request) -> Response:
+        return JSONResponse(map_to_json(bench))
+
+    def solve(body: bytes) -> dict[str, object]:
+        marks = points_by_id(read_message(Marks, body).facets)
+        solution = bench.solve(marks)
+        uncertainty_px = solution.uncertainty_px(bench.instrument.reflector)
+        made["marks"] = f"camera pose from {len(marks)} marked facets, {solution.rms_px:.2f} px rms"
+        return {
+            "facets": facets_to_json(bench.outlines_px(solution.pose)),
+            "residuals": [{"id": i, "px": round(r, 2)} for i, r in solution.residual_px.items()],
+            "rms_px": round(solution.rms_px, 2),
+            "uncertainty_px": round(uncertainty_px, 2),
+            "notes": bench.mark_notes(solution) + bench.notes(solution.pose),
+        }
+
+    def propose(body: bytes) -> dict[str, object]:
+        proposal = bench.propose(points_by_id(read_message(Marks, body).facets))
+        fit = proposal.fit
+        made["edges"] = (
+            f"camera pose fitted to the edges of {fit.seen_share:.0%} of the facets, {fit.rms_px:.2f} px rms"
+        )
+        return {
+            "facets": facets_to_json(bench.outlines_px(fit.pose)),
+            "seen_share": round(fit.seen_share, 3),
+            "doubts": list(proposal.doubts),
+            "notes": bench.notes(fit.pose),
+        }
+
+    def check(body: bytes) -> dict[str, object]:
+        return check_to_json(bench, read_message(Drawing, body))
+
+    def save(body: bytes) -> dict[str, object]:
+        drawing: Drawing = read_message(Drawing, body)
+        how = f"{made.get(drawing.basis, 'drawn by hand')}, looked over in the editor, {date.today().isoformat()}"
+        written = bench.save(points_by_id(drawing.facets), drawing.is_missing_confirmed, how)
+        return {"written": str(written), "n_facets": len(drawing.facets), "next": bench.next_step()}
+
+    return Starlette(
+        routes=[
+            Route("/", page),
+            Route("/picture.png", image),
+            Route("/map", first),
+            *(Route(f"/{work.__name__}", _answering(work), methods=["POST"]) for work in (solve, propose, check, save)),
+            Route("/{name}", page),
+        ],
+        middleware=[Middleware(Guard, host=host, token=token)],
+    )
+
+
+def _answering(work: Callable[[bytes], dict[str, object]]) -> Callable[[Request], object]:
+    """The request handler that lets `work` answer; what a person can mend comes back as text, status 422."""
+
+    async def answer(request: Request) -> Response:
+        body = await request.body()
+        try:
+            return JSONResponse(await run_in_threadpool(work, body))
+        except MarksError as error:
+            return JSONResponse({"error": str(error), "ids": list(error.facet_ids)}, 422)
+        except ConfigError as error:
+            return JSONResponse({"error": str(error), "ids": []}, 422)
+
+    return answer
+
+
+def serve(bench: Workbench, port: int, announce: Callable[[str], None]) -> None:
+    """Serve the editor on 127.0.0.1 until it is interrupted. Raises ConfigError for a port in use."""
+    try:
+        listener = socket.create_server(("127.0.0.1", port))
+    except OSError as error:
+        raise ConfigError(f"--port {port}: cannot be listened to ({error.strerror}); choose another, or 0") from None
+    host = f"127.0.0.1:{listener.getsockname()[1]}"
+    token = secrets.token_urlsafe(24)
+    server = uvicorn.Server(
+        uvicorn.Config(
+            build_app(bench, host, token),
+            ws="none",
+            lifespan="off",
+            log_level="error",
+            access_log=False,
+            server_header=False,
+            timeout_graceful_shutdown=1,
+        )
+    )
+    announce(f"Open this address in a browser on this computer: http://{host}/#{token}")
+    announce(f"The map goes to {bench.out}. End with Ctrl-C.")
+    with listener, suppress(KeyboardInterrupt):  # the server hands Ctrl-C on when it has ended
+        server.run(sockets=[listener])
