@@ -54,7 +54,7 @@ class AlignView(View):
     def recording(self, cycle: int, progress: Progress) -> None:
         """The recorder's own view."""
         if self._live is None:
-            self._live = TerminalView(self._console, f"cycle {cycle}").__enter__()
+            self._live = TerminalView(self._console, f"cycle {cycle}", has_estimate=False).__enter__()
         self._live.show(progress)
 
     def measured(self, cycle: Cycle, result: Reconstruction) -> None:

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from namod_ctl.app.alignment_files import alignment_from_json
+from namod_ctl.app.build import build_instrument
+from namod_ctl.app.build_twin import with_facet_map
+from namod_ctl.app.config import InstrumentConfig
 from namod_ctl.app.figure_style import DPI, ORANGE, SKY, figure_to_png
 from namod_ctl.app.figures import draw_psf_sum
 from namod_ctl.app.psf_panels import measured_panels
@@ -27,18 +31,21 @@ HISTORY_FILE, FACETS_FILE, SUMMARY_FILE = "a_sigma_history.png", "facets.csv", "
 PSF_FILE = "psf_before_and_after.png"
 
 
-def write_campaign_report(store: CampaignStore, instrument: Instrument) -> None:
-    """Write the report into the campaign's folder `report`; nothing while no cycle has a result."""
-    cycles = [cycle for cycle in store.cycles() if cycle.alignment_json is not None]
-    if not cycles:
-        return
-    files = {
-        HISTORY_FILE: figure_to_png(draw_history(cycles, instrument.name)),
-        FACETS_FILE: facet_text(cycles).encode(),
-        SUMMARY_FILE: summary_text(store).encode(),
-        PSF_FILE: _psf_picture(store, cycles[:1] + cycles[-1:] if len(cycles) > 1 else cycles, instrument),
-    }
-    folder = store.path / REPORT_FOLDER
+def write_campaign_report(path: Path) -> None:
+    """Write the report of the campaign at `path` into its folder `report`; nothing while no cycle has a result."""
+    with CampaignStore.open(path) as store:
+        cycles = [cycle for cycle in store.cycles() if cycle.alignment_json is not None]
+        if not cycles:
+            return
+        config = InstrumentConfig.from_json(store.config_json, f"{path}: config")
+        instrument = with_facet_map(build_instrument(config))
+        files = {
+            HISTORY_FILE: figure_to_png(draw_history(cycles, instrument.name)),
+            FACETS_FILE: facet_text(cycles).encode(),
+            SUMMARY_FILE: summary_text(store).encode(),
+            PSF_FILE: _psf_picture(store, cycles[:1] + cycles[-1:] if len(cycles) > 1 else cycles, instrument),
+        }
+    folder = path / REPORT_FOLDER
     folder.mkdir(exist_ok=True)
     write_results(folder, files)
 

@@ -162,7 +162,7 @@ def draw_psf_sum(panels: Sequence[PsfPanel], telescope: str, limit: AreaOfPsf | 
     figure.text(0.8 / size_in[0], 0.965, f"{telescope}: point spread function of the whole reflector", fontsize=12)
     footer = "Ellipse: one standard deviation of the light; its area is A_sigma."
     if limit is not None:
-        footer += f"  Ray-traced limit of perfectly aligned facets: {_area_text(limit)}."
+        footer += f"  Ray-traced limit of perfectly aligned facets without figure errors: {_area_text(limit)}."
     figure.text(0.8 / size_in[0], 0.015, footer, fontsize=9)
     return figure
 
@@ -194,4 +194,5 @@ def _area_text(area: AreaOfPsf) -> str:
     value, uncertainty = rad2_to_arcmin2(area.a_sigma_rad2), rad2_to_arcmin2(area.uncertainty_rad2)
     if not math.isfinite(value):
         return "unknown"
-    return f"{value:.1f} ± {uncertainty:.1f} arcmin²" if uncertainty > 0 else f"{value:.1f} arcmin²"
+    digits = 2 if 0.0 < uncertainty < 0.1 else 1
+    return f"{value:.{digits}f} ± {uncertainty:.{digits}f} arcmin²" if uncertainty > 0 else f"{value:.1f} arcmin²"

@@ -28,8 +28,8 @@ _STAR, _NEXT = "★", "✚"
 class TerminalView:
     """Shows the progress of a recording on a console; a context manager that leaves the last state standing."""
 
-    def __init__(self, console: Console, title: str) -> None:
-        self._console, self._title = console, title
+    def __init__(self, console: Console, title: str, *, has_estimate: bool = True) -> None:
+        self._console, self._title, self._has_estimate = console, title, has_estimate
         self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
         self._shown_s = -math.inf
         self._is_warned = self._is_halted = False
@@ -55,12 +55,14 @@ class TerminalView:
         self._shown_s = time_s
         self._is_warned, self._is_halted = bool(progress.warning), progress.is_halted
         if self._live is not None:
-            self._live.update(_panel(progress, self._title), refresh=True)
+            self._live.update(_panel(progress, self._title, has_estimate=self._has_estimate), refresh=True)
         else:
-            self._console.print(plain_line(progress), soft_wrap=True, markup=False, highlight=False)
+            self._console.print(
+                plain_line(progress, has_estimate=self._has_estimate), soft_wrap=True, markup=False, highlight=False
+            )
 
 
-def plain_line(progress: Progress) -> str:
+def plain_line(progress: Progress, *, has_estimate: bool = True) -> str:
     """The state of a recording in one line, and a second one when something is wrong."""
     wanted = "" if progress.n_wanted is None else f" of {progress.n_wanted}"
     parts = [
@@ -70,8 +72,9 @@ def plain_line(progress: Progress) -> str:
         f"{progress.rate_per_min:.0f} per minute",
         f"star {star_brightness(progress)}",
         f"coverage {progress.coverage.share:.0%}",
-        _uncertainty(progress),
     ]
+    if has_estimate:
+        parts.append(_uncertainty(progress))
     line = ", ".join(parts)
     wrong = progress.warning or progress.trouble
     return f"{line}\n  {wrong}" if wrong else line
@@ -116,11 +119,12 @@ def star_brightness(progress: Progress) -> str:
     return f"{progress.star_magnitude:+.2f} mag relative to the brightest of this run"
 
 
-def _panel(progress: Progress, title: str) -> RenderableType:
+def _panel(progress: Progress, title: str, *, has_estimate: bool) -> RenderableType:
     numbers = Table.grid(padding=(0, 2))
     wanted = "" if progress.n_wanted is None else f" of {progress.n_wanted}"
     numbers.add_row("records", f"{progress.n_accepted}{wanted}")
-    numbers.add_row("worst facet", _uncertainty(progress))
+    if has_estimate:
+        numbers.add_row("worst facet", _uncertainty(progress))
     numbers.add_row("time", f"{progress.elapsed_s / 60.0:.1f} min, {progress.rate_per_min:.0f} records per minute")
     numbers.add_row(
         "exposures", f"star {_exposure(progress.star_exposure_s)}, reflector {_exposure(progress.reflector_exposure_s)}"

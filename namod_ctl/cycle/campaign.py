@@ -89,12 +89,15 @@ class Campaign:
                 state = self.state
                 self._view.state(state, "")
                 getattr(self, f"_in_{state}")()
-                if state not in LISTENING:
+                if state not in LISTENING and self.state not in LISTENING:
                     self._poll()
         except StopAsked as stop:
             self._hold(str(stop))
         except (SafetyStop, DataQualityError) as error:
             self._hold(str(error))
+        except KeyboardInterrupt as stop:
+            self._hold(f"stopped by {stop}" if str(stop) else "stopped by Ctrl-C")
+            raise
         except BaseException as error:
             self._hold(f"{type(error).__name__}: {error}" if str(error) else type(error).__name__)
             raise
@@ -109,7 +112,13 @@ class Campaign:
         remarks = self._corrector.check()
         for remark in remarks:
             self._tell("check", remark)
-        self._machine.fire("ready", f"checked; {len(remarks)} remarks")
+        cycles = self._store.cycles()
+        asked = self._store.turns()
+        if cycles and asked and asked[0].cycle == cycles[-1].number and not all(turns.is_done for turns in asked):
+            self._machine.fire("wait", "people have not turned all that they were asked for")
+            self._remind()
+        else:
+            self._machine.fire("ready", f"checked; {len(remarks)} remarks")
 
     def _in_recording(self) -> None:
         cycle = cycle_to_record(self._store)

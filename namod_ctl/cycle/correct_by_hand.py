@@ -69,7 +69,11 @@ class ManualCorrector:
         if len(alignments) < 2:
             return []
         before, after = (alignments[number] for number in sorted(alignments)[-2:])
-        asked = {turns.facet_id: np.array(turns.turns_deg) for turns in self._store.turns(sorted(alignments)[-2])}
+        asked = {
+            turns.facet_id: np.array(turns.turns_deg)
+            for turns in self._store.turns(sorted(alignments)[-2])
+            if turns.is_done  # of the others nobody said that they were turned
+        }
         if not asked:
             return []
         was, is_now = (
@@ -83,7 +87,7 @@ class ManualCorrector:
         self.has_learned = bool(mistakes) and kinds[TurnKind.WRONG_DIRECTION] <= len(asked) / 2
         summary = f"{kinds[TurnKind.RIGHT]} of {len(asked)} facets were turned as asked"
         if kinds[TurnKind.TOO_SMALL]:
-            summary += f"; at {kinds[TurnKind.TOO_SMALL]} the turns asked for were too small to tell"
+            summary += f"; of {kinds[TurnKind.TOO_SMALL]} facets nothing can be told, as their turns were small"
         n_unseen = len(asked) - kinds.total()
         if n_unseen:
             summary += f"; {n_unseen} were not seen before or after"

@@ -55,7 +55,7 @@ TRANSITIONS: tuple[Transition, ...] = (
     Transition("approve", ("previewing", "awaiting_approval"), "correcting"),
     Transition("changed", ("awaiting_approval", "correcting"), "previewing"),
     Transition("instruct", ("previewing",), "instructing"),
-    Transition("wait", ("instructing",), "awaiting_operator"),
+    Transition("wait", ("instructing", "checking"), "awaiting_operator"),
     Transition("done", ("awaiting_operator",), "recording"),
     Transition("corrected", ("correcting", "undoing"), "recording"),
     Transition("hold", WORKING, "held"),

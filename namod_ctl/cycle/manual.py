@@ -25,6 +25,8 @@ from namod_ctl.optics.mounts import Mount
 
 Array = NDArray[np.float64]
 
+# More possibilities help nobody on a ladder.
+_N_TOLD = 3
 # Less than this share counts as not done, more than the other as done.
 _SHARE = GainPrior(0.2, 0.8, is_logarithmic=False)
 # One bolt of several turned the wrong way, all bolts taken in turn from the wrong one, another facet's turns besides
@@ -192,8 +194,10 @@ def _finding(history: FacetHistory, verdict: Verdict, asked_deg: Array) -> TurnF
     seen, wanted = _arcmin(history.change_rad[0]), _arcmin(history.expected_rad[0])
     evidence = f"Theta changed by {seen}, {wanted} was asked for"
     if story is None:
-        words = "; or ".join(_in_words(TurnKind(one.kind), one, history) for one in verdict.rivals)
-        could_be = f"it could be: {words}; or none of these" if words else "no single mistake explains it"
+        # the most probable come first; the same words may stand for several stories
+        words = list(dict.fromkeys(_in_words(TurnKind(one.kind), one, history) for one in verdict.rivals))
+        listed = "; or ".join(words[:_N_TOLD])
+        could_be = f"it could be: {listed}; or something else" if words else "no single mistake explains it"
         sentence = f"facet {facet_id}: something else than asked was done; {could_be} ({evidence})"
         return TurnFinding(facet_id, TurnKind.UNCLEAR, (), None, math.nan, 0.0, unknown, sentence)
     kind = TurnKind(story.kind)

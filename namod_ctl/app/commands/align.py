@@ -88,7 +88,7 @@ def align(
 ) -> None:
     """Align the telescope: record, reconstruct and correct until the point spread function has converged.
 
-    Facets with motors are moved; without [actuators] in the config people get sheets with bolt turns. From another
+    Facets with motors are moved; without actuators in the config people get sheets with bolt turns. From another
     terminal: namod-ctl status, pause, resume, stop, approve, done. Ctrl-C stops all motion and holds the campaign.
 
     Example: namod-ctl align --out CAMPAIGN
@@ -113,11 +113,11 @@ def align(
             console.print(
                 f"live page: {stack.enter_context(dashboard_beside(store.path))}", soft_wrap=True, markup=False
             )
+        # written last, when the campaign is free for others: it takes some seconds
+        stack.callback(write_campaign_report, store.path)
+        stack.enter_context(store)
         with _stopped_by_sigterm():
-            try:
-                state = opened.campaign.run()
-            finally:
-                write_campaign_report(store, twin.instrument)
+            state = opened.campaign.run()
         console.print(cycle_table(store.cycles()))
         ratio = twin.reflector.a_sigma_now_rad2() / twin.reflector.a_sigma_aligned_rad2()
         console.print(f"The twin's truth: A_sigma is {ratio:.3f} times that of the same facets perfectly aligned.")

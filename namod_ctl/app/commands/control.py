@@ -119,7 +119,8 @@ def _ask_running(campaign: Path | None, kind: RequestKind) -> None:
     path = choose_campaign(campaign)
     if running_pid(path) is None:
         _refuse(
-            f"nobody is running {path}, so there is nothing to {kind}; 'namod-ctl status {path}' says how it stands"
+            f"nobody is running {path}, so there is nothing to {kind}; 'namod-ctl status {path}' says how it stands. A "
+            "program that is only just starting is not told: ask again in a moment"
         )
     _ask(path, Request(kind=kind))
 

@@ -160,7 +160,7 @@ def _print(standing: Mapping[str, Any]) -> None:
 
 
 def _cycle_table(cycles: list[dict[str, Any]]) -> Table:
-    table = Table("cycle", "records", "A_sigma [arcmin2]", "predicted", "limit", "decision")
+    table = Table("cycle", "records", "A_sigma [arcmin2]", "predicted", "ideal mirrors", "decision")
     for cycle in cycles:
         area = cycle["a_sigma_arcmin2"]
         spread = f" +- {area['now_uncertainty']:.2f}" if area["now_uncertainty"] is not None else ""
@@ -170,7 +170,7 @@ def _cycle_table(cycles: list[dict[str, Any]]) -> Table:
             _area(area["now"]) + spread,
             _area(area["predicted_after_correction"]),
             _area(area["limit"]),
-            cycle["decision"],
+            cycle["decision"].split(":")[0],
         )
     return table
 
