@@ -181,7 +181,9 @@ def test_a_campaign_killed_again_and_again_ends_as_one_that_is_not(nursery: Nurs
 
     with CampaignStore.open(path) as killed, CampaignStore.open(whole) as never:
         assert killed.last_state() == never.last_state() == "converged"
-        assert len(killed.cycles()) == len(never.cycles())
+        # the same end, not the same way: while nobody runs the program the telescope wanders on, so that a recording
+        # with gaps may need one correction more
+        assert len(never.cycles()) <= len(killed.cycles()) <= len(never.cycles()) + 1
         assert all(cycle.n_records >= N_RECORDS for cycle in killed.cycles())
     now = records_of(path)
     assert all(now[run][: len(records)] == records for run, records in kept.items())

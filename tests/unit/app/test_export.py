@@ -129,7 +129,7 @@ def test_instruct_writes_list_picture_and_sheets(run, tmp_path, namod_ctl):
     picture = cv2.imread(str(out / "instructions.png"))
     assert picture.shape[1] % 1215 == 0
     assert (out / "instructions.pdf").read_bytes().startswith(b"%PDF")
-    assert "do not turn" in done.stdout
+    assert "Do not turn facet" in done.stdout
     assert not (run / "instructions.csv").exists()
 
 
