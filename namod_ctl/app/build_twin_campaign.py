@@ -70,7 +70,11 @@ def open_twin_campaign(
     with ExitStack() as stack:
         twin = build_twin(config, settings, seed, twin_wiring(config))
         stack.callback(open_world(store.path / WORLD_FILE, twin).close)
-        record = replace(build_record_settings(config), pace_s=twin.telescope.pass_s / wishes.n_records)
+        record = replace(
+            build_record_settings(config),
+            pace_s=twin.telescope.pass_s / wishes.n_records,
+            region_radius_rad=settings.telescope.radius_rad,
+        )
         equipment = Equipment(twin.star_camera, twin.reflector_camera, twin.clock, twin.wall_clock)
         outside = Outside(lambda: equipment, alignment_to_json, alignment_from_json, _write_cycle)
         corrector: Corrector

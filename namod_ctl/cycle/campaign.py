@@ -33,6 +33,9 @@ MAX_POOR_RECORDINGS = 2
 
 MAX_CHANGED_PREVIEWS = 3
 
+MIN_COVERAGE = 0.8
+"""Of the region: a recording that was interrupted has gaps, and facets whose light falls there are known badly."""
+
 LISTENING = frozenset({"recording", "paused", "awaiting_approval", "awaiting_operator"})
 """States that answer requests themselves."""
 
@@ -137,7 +140,7 @@ class Campaign:
                         self._refuse(request)
 
             wanted = self._settings.n_records * (1 + self._n_poor)  # once more as many where they did not suffice
-            reason = recorder.record(StopRule(n_records=wanted), on_progress)
+            reason = recorder.record(StopRule(n_records=wanted, min_coverage=MIN_COVERAGE), on_progress)
             n_accepted = recorder.progress().n_accepted
         self._store.save_cycle(replace(cycle, n_records=n_accepted))
         if self.state == "recording":

@@ -117,16 +117,20 @@ class StopRule:
         Of this session, on the cameras' clock: pairs that were begun before count. The cameras keep it, see `pairs`.
     uncertainty_rad
         Of the facet that is known worst. Facets that were not seen hold it up until the region is covered.
+    min_coverage
+        Share of the region below which twice `n_records` are taken: a recording with gaps misses facets.
     """
 
     n_records: int | None = None
     duration_s: float | None = None
     uncertainty_rad: float | None = None
+    min_coverage: float = 0.0
 
     def reason_to_stop(self, progress: Progress) -> str:
         """Why the recording is complete, for a person; empty while it is not."""
         estimate = progress.estimate
-        if self.n_records is not None and progress.n_accepted >= self.n_records:
+        is_covered = progress.coverage.share >= self.min_coverage
+        if self.n_records is not None and progress.n_accepted >= self.n_records * (1 if is_covered else 2):
             return "all records wanted are there"
         if self.uncertainty_rad is None or estimate is None or estimate.n_records < MIN_RECORDS_FOR_UNCERTAINTY:
             return ""
