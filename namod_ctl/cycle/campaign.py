@@ -180,6 +180,10 @@ class Campaign:
         if decision is Decision.VAGUE:
             self._record_again(why)
             return
+        if decision is Decision.WORSE and not self._n_poor:
+            # gaps in the pointings look alike, and taking back a good correction costs more than a longer look
+            self._record_again(f"{why}; a longer look must confirm it")
+            return
         self._n_poor = 0
         self._store.save_cycle(replace(cycle, decision=f"{decision.value}: {why}"))
         self._view.measured(self._store.cycles()[-1], result)
