@@ -14,7 +14,7 @@ from playwright.sync_api import Browser, Page, expect, sync_playwright
 sys.path.append(str(Path(__file__).parents[1] / "unit" / "app"))
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")  # while it is there an event loop runs in this thread, and nobody can begin another
 def browser() -> Iterator[Browser]:
     chromium = shutil.which("chromium")
     if chromium is None:
