@@ -9,6 +9,7 @@ from namod_ctl.app.actuator_schema import FACTORY_BAUD, LOOPBACK, MODBUS, Actuat
 from namod_ctl.app.actuator_wiring import n_legs_of, wires_of
 from namod_ctl.app.build_actuators import build_motion_settings
 from namod_ctl.app.config import InstrumentConfig
+from namod_ctl.app.number_ranges import counted, runs_in_words
 from namod_ctl.core.units import m_to_mm
 
 PROTOCOL_WORDS = {"tmcl": "TMCL", "zaber": "Zaber ASCII", "modbus_rtu": "Modbus RTU", "modbus_tcp": "Modbus TCP"}
@@ -24,7 +25,12 @@ def actuator_rows(config: InstrumentConfig) -> tuple[tuple[str, str], ...]:
     n_facets = len(_wired_facets(config))
     motion = build_motion_settings(config)
     low_mm, high_mm = actuators.range_mm
-    rows = [("drives", f"{n_drives} on {len(actuators.buses)} buses, for {n_facets} of {len(config.facets)} facets")]
+    rows = [
+        (
+            "drives",
+            f"{n_drives} on {counted(len(actuators.buses), 'bus')}, for {n_facets} of {len(config.facets)} facets",
+        )
+    ]
     if actuators.step_um is not None:
         rows.append(("step", f"{actuators.step_um:g} um"))
     rows += [
@@ -52,7 +58,7 @@ def actuator_warnings(config: InstrumentConfig) -> list[str]:
     warnings = []
     by_hand = sorted({facet.id for facet in config.facets} - _wired_facets(config))
     if by_hand:
-        warnings.append(f"facets without drives, which stay as they are: {', '.join(map(str, by_hand))}")
+        warnings.append(f"facets without drives, which stay as they are: {runs_in_words(by_hand)}")
     if actuators.motion.approach_mm == 0.0 and config.mount.backlash_um > 0.0:
         warnings.append(
             f"legs have a play of {config.mount.backlash_um:g} um and are not approached from one side "
@@ -66,20 +72,20 @@ def actuator_warnings(config: InstrumentConfig) -> list[str]:
 
 def _bus_in_words(actuators: ActuatorsSection, bus: BusSection, n_legs: int) -> str:
     wires = wires_of(actuators, bus, n_legs)
-    addresses = _span(wire.address for wire in wires)
-    axes = "" if bus.protocol in MODBUS else f", axes {_span(wire.axis for wire in wires)}"
+    addresses = _span("address", "addresses", (wire.address for wire in wires))
+    axes = "" if bus.protocol in MODBUS else f", {_span('axis', 'axes', (wire.axis for wire in wires))}"
     register_map = register_map_of(bus, bus.name)
     kind = "" if register_map is None else f" ({register_map.name})"
     baud = "" if bus.protocol == "modbus_tcp" else f" at {bus.baud or FACTORY_BAUD[bus.protocol]} baud"
     return (
-        f"{PROTOCOL_WORDS[bus.protocol]}{kind} on {bus.url}{baud}: {len(wires)} drives, addresses {addresses}{axes}; "
-        f"at most {bus.max_moving} move at once; {bus.timeout_s:g} s for an answer, {bus.retries} retries"
+        f"{PROTOCOL_WORDS[bus.protocol]}{kind} on {bus.url}{baud}: {counted(len(wires), 'drive')}, {addresses}{axes}; "
+        f"at most {bus.max_moving} at once; {bus.timeout_s:g} s for an answer, asked again up to {bus.retries} times"
     )
 
 
-def _span(numbers: Iterable[int]) -> str:
+def _span(one: str, many: str, numbers: Iterable[int]) -> str:
     found = sorted(set(numbers))
-    return str(found[0]) if len(found) == 1 else f"{found[0]} to {found[-1]}"
+    return f"{one if len(found) == 1 else many} {runs_in_words(found)}"
 
 
 def _wired_facets(config: InstrumentConfig) -> set[int]:

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from rich.table import Table
 from rich.text import Text
 
+from namod_ctl.app.number_ranges import legs_in_words, runs_in_words
 from namod_ctl.core.drives import DriveState, Leg
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.motion import MoveOrder, MoveOutcome, MoveResult
@@ -42,34 +43,42 @@ def legs_named(names: Sequence[str], known: Iterable[Leg]) -> tuple[Leg, ...]:
         chosen = [leg for leg in legs if leg.facet_id == facet_id and index in (None, leg.index)]
         if not chosen:
             of_facet = [short_name(leg) for leg in legs if leg.facet_id == facet_id]
-            facet_ids = dict.fromkeys(str(leg.facet_id) for leg in legs)
-            there = f"legs {', '.join(of_facet)}" if of_facet else f"facets {', '.join(facet_ids)}"
+            facet_ids = [leg.facet_id for leg in legs]
+            there = f"legs {', '.join(of_facet)}" if of_facet else f"facets {runs_in_words(facet_ids)}"
             raise ConfigError(f"leg {name}: the config has no drive for it; with drives there are {there}")
         found.update(dict.fromkeys(chosen))
     return tuple(found)
 
 
 def table_of_drives(
-    states: Mapping[Leg, DriveState | str], identities: Mapping[Leg, str], names: Mapping[Leg, str]
+    states: Mapping[Leg, DriveState | str], names: Mapping[Leg, str], bus_names: Mapping[Leg, str]
 ) -> Table:
-    """What each drive says of itself."""
-    table = _table("leg", "drive", "position mm", "homed", "state", "temperature", "identity")
+    """What each drive says of itself; a bus goes by its name in the config, as paths of lines are long."""
+    table = _table("leg", "bus", "drive", "position mm", "homed", "state", "temp.")
     for leg, state in states.items():
+        drive = names[leg].partition(" on ")[0]
         if isinstance(state, str):
-            table.add_row(short_name(leg), names[leg], "-", "-", Text(state, style="red"), "-", "-")
+            table.add_row(short_name(leg), bus_names[leg], drive, "-", "-", Text(state, style="red"), "-")
             continue
         faults = "; ".join(state.faults)
-        temperature = "-" if state.temperature_k is None else f"{k_to_celsius(state.temperature_k):.0f} C"
         table.add_row(
             short_name(leg),
-            names[leg],
+            bus_names[leg],
+            drive,
             _mm(state.position_m),
             "yes" if state.is_homed else Text("no", style="yellow"),
             Text(faults, style="red") if faults else "moves" if state.is_moving else "stands",
-            temperature,
-            identities[leg] or "-",
+            "-" if state.temperature_k is None else f"{k_to_celsius(state.temperature_k):.0f} C",
         )
     return table
+
+
+def identity_lines(identities: Mapping[Leg, str]) -> list[str]:
+    """What kinds of drives there are, a line for each with its legs."""
+    legs_of: dict[str, list[Leg]] = {}
+    for leg, identity in identities.items():
+        legs_of.setdefault(identity or "says nothing of itself", []).append(leg)
+    return [f"{identity}: {legs_in_words(legs)}" for identity, legs in legs_of.items()]
 
 
 def table_of_orders(orders: Sequence[MoveOrder]) -> Table:
@@ -106,12 +115,10 @@ def table_of_words(title: str, words: Mapping[Leg, str]) -> Table:
 
 def table_of_tests(tests: Sequence[LegTest]) -> Table:
     """What the self-test found."""
-    table = _table("leg", "out by mm", "back by mm", "watched", "result", "identity")
+    table = _table("leg", "error up mm", "error back mm", "watched", "result")
     for test in tests:
         result = Text("passed", style="green") if test.has_passed else Text("; ".join(test.problems), style="red")
-        table.add_row(
-            short_name(test.leg), _mm(test.out_m), _mm(test.back_m), str(test.n_watched), result, test.identity or "-"
-        )
+        table.add_row(short_name(test.leg), _mm(test.out_m), _mm(test.back_m), str(test.n_watched), result)
     return table
 
 

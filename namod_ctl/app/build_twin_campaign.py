@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,6 +17,8 @@ from namod_ctl.app.config import InstrumentConfig
 from namod_ctl.app.instruction_sheets import PDF_FILE
 from namod_ctl.app.reconstruction_report import REPORT_FILE, report_text
 from namod_ctl.core.clock import Clock
+from namod_ctl.core.drives import DriveState, Leg
+from namod_ctl.core.errors import StoreError
 from namod_ctl.core.motion import StopSwitch
 from namod_ctl.cycle.campaign import Campaign
 from namod_ctl.cycle.campaign_parts import CampaignSettings, Outside, View
@@ -59,8 +61,8 @@ def open_twin_campaign(
 ) -> Iterator[TwinCampaign]:
     """The campaign in `store` on the twin of its config; by motors where the config has [actuators], else by people.
 
-    The twin goes on where its world in the campaign's folder stands. `wishes.record.pace_s` is chosen here, so that a
-    cycle's records fill one pass of the telescope over its region.
+    The twin goes on where its world in the campaign's folder stands. Of `wishes.record` only `keep_frames` is used: the
+    pace is chosen so that a cycle's records fill one pass of the telescope over its region, the rest is in the config.
 
     Parameters
     ----------
@@ -74,6 +76,7 @@ def open_twin_campaign(
             build_record_settings(config),
             pace_s=twin.telescope.pass_s / wishes.n_records,
             region_radius_rad=settings.telescope.radius_rad,
+            keep_frames=wishes.record.keep_frames,
         )
         equipment = Equipment(twin.star_camera, twin.reflector_camera, twin.clock, twin.wall_clock)
         outside = Outside(lambda: equipment, alignment_to_json, alignment_from_json, _write_cycle)
@@ -102,7 +105,12 @@ def _by_motors(
     buses = stack.enter_context(build_twin_actuators(config, twin.drives))
     motion = build_motion_settings(config)
     drives = {leg: drive for bus in buses for leg, drive in bus.drives.items()}
-    mover = Mover(buses, twin.clock, motion, switch)
+
+    def show(heard: Mapping[Leg, DriveState | str]) -> None:
+        with suppress(StoreError):  # the journal, which matters, meets the same trouble and says so
+            store.show_legs(heard)
+
+    mover = Mover(buses, twin.clock, motion, switch, show)
     return MotorCorrector(store, twin.instrument, mover, drives, motion, twin.clock)
 
 

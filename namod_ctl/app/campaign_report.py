@@ -16,9 +16,14 @@ from namod_ctl.app.build_twin import with_facet_map
 from namod_ctl.app.config import InstrumentConfig
 from namod_ctl.app.figure_style import DPI, ORANGE, SKY, figure_to_png
 from namod_ctl.app.figures import draw_psf_sum
+from namod_ctl.app.number_ranges import counted
 from namod_ctl.app.psf_panels import measured_panels
+from namod_ctl.app.report.journal import journal_rows
+from namod_ctl.app.report.parts import area_text, when_text
 from namod_ctl.core.units import rad2_to_arcmin2, rad_to_arcmin
+from namod_ctl.cycle.machine import STATES
 from namod_ctl.optics.instrument import Instrument
+from namod_ctl.reconstruction.alignment import AreaOfPsf
 from namod_ctl.reconstruction.reconstruct import reconstruct
 from namod_ctl.reconstruction.responses import tabulate_responses
 from namod_ctl.store.campaign import CampaignStore
@@ -105,14 +110,21 @@ def facet_text(cycles: list[Cycle]) -> str:
 
 def summary_text(store: CampaignStore) -> str:
     """Cycles, then everything in the journal, in plain words."""
-    lines = [f"{store.path.name}: {store.source}", f"begun {store.created_utc}, state {store.last_state()}", ""]
-    lines += [
-        f"cycle {cycle.number}: {cycle.n_records} records, A_sigma {rad2_to_arcmin2(cycle.a_sigma_now_rad2):.2f} "
-        f"+- {rad2_to_arcmin2(cycle.a_sigma_uncertainty_rad2):.2f} arcmin2; {cycle.decision}"
-        for cycle in store.cycles()
+    state = store.last_state() or "idle"
+    lines = [
+        f"Campaign {store.path.name}: {store.source}",
+        f"Begun {when_text(store.created_utc)}. Now {state.replace('_', ' ')}: {STATES.get(state, '')}.",
+        "",
+        "A_sigma, the area of the point spread function of the whole mirror, in square minutes of arc:",
     ]
-    lines.append("")
-    lines += [f"{event.time_utc}  {event.kind}: {event.text}" for event in store.events()]
+    for cycle in store.cycles():
+        area = AreaOfPsf(cycle.a_sigma_now_rad2, cycle.a_sigma_uncertainty_rad2)
+        lines.append(f"  cycle {cycle.number}: {area_text(area)}, from {counted(cycle.n_records, 'record')}")
+        if cycle.decision:
+            lines.append(f"           then: {cycle.decision}")
+    lines += ["", "What happened:"]
+    for when, what, why in journal_rows(store.events()):
+        lines += [f"  {when}  {what}", f"{'':27}why: {why}"] if why else [f"  {when}  {what}"]
     return "\n".join(lines) + "\n"
 
 

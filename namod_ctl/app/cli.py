@@ -14,11 +14,15 @@ from namod_ctl import __version__
 from namod_ctl.app.greeting import GREETING
 from namod_ctl.core.errors import NamodError
 
+MARKUP = "markdown"  # typer's default swallows what is written in brackets, such as [default: auto]
+
 # A command's module is imported when the command is called, so that none waits for the libraries of another.
 _COMMANDS = {
     "config": "namod_ctl.app.commands.config:app",
     "facets": "namod_ctl.app.commands.facets:app",
     "import": "namod_ctl.app.commands.imports:app",
+    "devices": "namod_ctl.app.commands.devices:devices",
+    "camera": "namod_ctl.app.commands.camera:app",
     "record": "namod_ctl.app.commands.record:record",
     "align": "namod_ctl.app.commands.align:align",
     "actuators": "namod_ctl.app.commands.actuators:app",
@@ -53,7 +57,10 @@ class _Commands(TyperGroup):
         module, name = _COMMANDS[cmd_name].split(":")
         target = getattr(import_module(module), name)
         if not isinstance(target, typer.Typer):
-            function, target = target, typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+            function, target = (
+                target,
+                typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=MARKUP),
+            )
             target.command(cmd_name)(function)
         command = typer.main.get_command(target)
         command.name = cmd_name
@@ -74,6 +81,7 @@ app = typer.Typer(
     invoke_without_command=True,
     add_completion=True,
     pretty_exceptions_enable=False,
+    rich_markup_mode=MARKUP,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 

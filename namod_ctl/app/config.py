@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
-import numpy as np
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 import namod_ctl
-from namod_ctl.app.actuator_problems import actuator_problems
 from namod_ctl.app.actuator_schema import ActuatorsSection
+from namod_ctl.app.camera_problems import with_whole_folder
+from namod_ctl.app.config_contradictions import contradictions
 from namod_ctl.app.config_extends import read_extended
 from namod_ctl.app.config_problems import describe_problems
 from namod_ctl.app.config_schema import (
@@ -22,21 +23,16 @@ from namod_ctl.app.config_schema import (
     ReflectorMapSection,
     ReflectorSection,
 )
-from namod_ctl.app.parts import mount_of, reflector_of
+from namod_ctl.app.config_section import Section
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.units import rad_to_deg
 from namod_ctl.devices.drive_maps import read_drive_map
-from namod_ctl.optics.layouts import Dish, Layout, generate_reflector, overlapping_facets
-from namod_ctl.optics.polygons import polygon_fault
+from namod_ctl.optics.layouts import Dish, Layout, generate_reflector
 from namod_ctl.optics.reflector import Facet, FacetShape
 from namod_ctl.store.facet_lists import read_mars, read_sim_telarray
 from namod_ctl.store.facet_tables import read_facet_table, read_polygon_table
 
-MAX_RADIUS_SHARE = 1.5  # of the focal length: no Cherenkov telescope is faster than F/D = 0.33
-MIN_HEIGHT_SHARE = -0.02  # of the focal length: measured dishes scatter around the vertex, not below
-FACET_FOCAL_SHARES = (0.5, 3.0)  # of the telescope's focal length
 MAX_REPORTED_PROBLEMS = 40  # a wrong unit in a list of 1000 facets needs no 1000 lines
-MAX_OVERLAP_SHARE = 0.02  # of a facet's area: measured positions are good to some mm
 SAME_ANGLE_DECIMALS = 12  # of a degree: takes the rounding of deg -> rad -> deg away
 
 
@@ -66,7 +62,10 @@ class InstrumentConfig(InstrumentSections):
             raw = json.loads(text)
         except (ValueError, RecursionError) as error:
             raise ConfigError(f"{source}: the stored config is no JSON: {error}") from None
-        config = _validate(raw, source)
+        try:
+            config = cls.model_validate(raw)
+        except ValidationError as error:
+            raise _together(describe_problems(error, cls, source)) from None
         if config.reflector.facets is None:
             raise ConfigError(f"{source}: reflector: the stored config must hold its facets written out")
         if config.reflector_map is not None and config.reflector_map.polygons is None:
@@ -74,7 +73,7 @@ class InstrumentConfig(InstrumentSections):
         buses = config.actuators.buses if config.actuators is not None else ()
         if any(isinstance(bus.drive_map, str) for bus in buses):
             raise ConfigError(f"{source}: actuators: the stored config must hold its register maps written out")
-        _raise_together(_contradictions(config, source))
+        _raise_together(contradictions(config, cls.model_fields.keys(), source))
         return config
 
 
@@ -103,43 +102,56 @@ def find_config(name_or_path: str | Path) -> Path:
     )
 
 
-def load_config(name_or_path: str | Path) -> InstrumentConfig:
+def load_config(name_or_path: str | Path, *, has_map: bool = True) -> InstrumentConfig:
     """The config of a built-in name or a TOML file, with the files it names read and everything checked.
+
+    Without `has_map` the map of facets is left out, as if the config had none: for those who are about to make it.
 
     Raises
     ------
     ConfigError
-        All problems together, each with file, key, value, rule and remedy.
+        All problems that can be found together, each with file, key, value, rule and remedy.
     """
     path = find_config(name_or_path)
     raw, source = read_extended(path, find_config)
-    config = _validate(raw, source)
+    if not has_map:
+        raw.pop("reflector_map", None)
     problems: list[str] = []
-    reflector = config.reflector
-    reflector_map = config.reflector_map
-    try:
-        reflector = ReflectorSection(facets=_facets_of(config, path))
-    except ConfigError as problem:
-        problems.append(str(problem))
-    if reflector_map is not None and reflector_map.polygons_file is not None:
+    config, known = _sound_sections(raw, source, problems)
+    readers: dict[str, Callable[[], Section | None]] = {
+        "reflector": lambda: ReflectorSection(facets=_facets_of(config, path)),
+        "reflector_map": lambda: _written_out_map(config.reflector_map, path.parent),
+        "actuators": lambda: _with_drive_maps(config.actuators, path.parent, source),
+    }
+    if "telescope" not in known and "reflector" in known and _needs_focal_length(config.reflector):
+        known.discard("reflector")
+    written_out: dict[str, Section | None] = {}
+    for name in [name for name in readers if name in known]:
         try:
-            reflector_map = _read_map(path.parent / reflector_map.polygons_file)
+            written_out[name] = readers[name]()
         except ConfigError as problem:
             problems.append(str(problem))
-    actuators = config.actuators
-    if actuators is not None:
-        actuators = _with_drive_maps(actuators, path.parent, source, problems)
-    _raise_together(problems)
-    config = config.model_copy(update={"reflector": reflector, "reflector_map": reflector_map, "actuators": actuators})
-    _raise_together(_contradictions(config, source))
+            known.discard(name)
+    for name in sorted(known & {"star_camera", "reflector_camera"}):
+        written_out[name] = with_whole_folder(getattr(config, name), path.parent)
+    config = config.model_copy(update=written_out)
+    _raise_together(problems + contradictions(config, known, source))
     return config
 
 
-def _validate(raw: Any, source: str) -> InstrumentConfig:
+def _sound_sections(raw: dict[str, Any], source: str, problems: list[str]) -> tuple[InstrumentConfig, set[str]]:
+    """The config without the sections that are wrong in themselves, and the names of all others; what is wrong is told.
+
+    A section that is wrong is absent from the config, not None.
+    """
     try:
-        return InstrumentConfig.model_validate(raw)
+        return InstrumentConfig.model_validate(raw), set(InstrumentConfig.model_fields)
     except ValidationError as error:
-        raise _together(describe_problems(error, InstrumentConfig, source)) from None
+        problems += describe_problems(error, InstrumentConfig, source)
+        known = InstrumentConfig.model_fields.keys() - {detail["loc"][0] for detail in error.errors() if detail["loc"]}
+    types = get_type_hints(InstrumentConfig, include_extras=True)
+    sections = {name: TypeAdapter(types[name]).validate_python(raw[name]) for name in known & raw.keys()}
+    return InstrumentConfig.model_construct(**sections), known
 
 
 def _together(problems: list[str]) -> ConfigError:
@@ -152,6 +164,11 @@ def _together(problems: list[str]) -> ConfigError:
 def _raise_together(problems: list[str]) -> None:
     if problems:
         raise _together(problems)
+
+
+def _needs_focal_length(section: ReflectorSection) -> bool:
+    """Does the telescope's focal length decide where the facets are?"""
+    return section.layout is not None or section.format == "sim_telarray"
 
 
 def _facets_of(config: InstrumentConfig, path: Path) -> tuple[FacetSection, ...]:
@@ -208,7 +225,15 @@ def _facet_section(facet: Facet, path: Path) -> FacetSection:
         raise ConfigError("\n".join(describe_problems(error, FacetSection, f"{path}: facet {facet.id}"))) from None
 
 
-def _read_map(path: Path) -> ReflectorMapSection:
+def _written_out_map(section: ReflectorMapSection | None, folder: Path) -> ReflectorMapSection | None:
+    if section is None or section.polygons_file is None:
+        return section
+    path = folder / section.polygons_file
+    if not path.is_file():
+        raise ConfigError(
+            f"{path}: there is no such file, but reflector_map.polygons_file = {section.polygons_file!r} names it; "
+            "make it with 'namod-ctl facets edit', or take [reflector_map] out (then no images can be measured)"
+        )
     polygons = []
     for facet_id, corners_px in read_polygon_table(path).items():
         corners = tuple((float(x_px), float(y_px)) for x_px, y_px in corners_px)
@@ -220,9 +245,11 @@ def _read_map(path: Path) -> ReflectorMapSection:
     return ReflectorMapSection(polygons=tuple(polygons))
 
 
-def _with_drive_maps(actuators: ActuatorsSection, folder: Path, source: str, problems: list[str]) -> ActuatorsSection:
-    """The section with its register maps written out; those that cannot be read go into `problems`."""
-    buses = []
+def _with_drive_maps(actuators: ActuatorsSection | None, folder: Path, source: str) -> ActuatorsSection | None:
+    """The section with its register maps written out. Raises ConfigError with all that cannot be read."""
+    if actuators is None:
+        return None
+    buses, problems = [], []
     for number, bus in enumerate(actuators.buses, start=1):
         if isinstance(bus.drive_map, str):
             try:
@@ -232,100 +259,5 @@ def _with_drive_maps(actuators: ActuatorsSection, folder: Path, source: str, pro
             else:
                 bus = bus.model_copy(update={"drive_map": table})
         buses.append(bus)
+    _raise_together(problems)
     return actuators.model_copy(update={"buses": tuple(buses)})
-
-
-def _contradictions(config: InstrumentConfig, source: str) -> list[str]:
-    """What is wrong between values that are plausible one by one; one text per problem."""
-    ids = [facet.id for facet in config.facets]
-    problems = [
-        f"{source}: reflector: facet id {facet_id} occurs {ids.count(facet_id)} times; every facet needs its own"
-        for facet_id in sorted(set(ids))
-        if ids.count(facet_id) > 1
-    ]
-    problems += _misplaced_facets(config, source)
-    try:
-        mount_of(config.mount, config.mount.orientation_deg).check_geometry(f"{source}: mount")
-    except ConfigError as problem:
-        problems.append(str(problem))
-    if not problems:
-        problems += _overlaps(config, source)
-    for key in config.mount.facet_orientation_deg:
-        if key not in set(map(str, ids)):
-            problems.append(f"{source}: mount.facet_orientation_deg.{key}: there is no facet of this id")
-    if config.actuators is not None:
-        problems += actuator_problems(config.actuators, config.mount, ids, source)
-    return problems + _bad_polygons(config, set(ids), source) + _bad_target(config, source)
-
-
-def _misplaced_facets(config: InstrumentConfig, source: str) -> list[str]:
-    focal_length_m = config.telescope.focal_length_m
-    problems = []
-    for facet in config.facets:
-        x_m, y_m, z_m = facet.position_m
-        radius_m = float(np.hypot(x_m, y_m))
-        share = facet.focal_length_m / focal_length_m
-        if radius_m > MAX_RADIUS_SHARE * focal_length_m:
-            problems.append(
-                f"{source}: reflector: facet {facet.id} stands {radius_m:g} m from the axis, more than "
-                f"{MAX_RADIUS_SHARE:g} focal lengths of {focal_length_m:g} m: check the unit of positions"
-            )
-        if not MIN_HEIGHT_SHARE * focal_length_m <= z_m < focal_length_m:
-            problems.append(
-                f"{source}: reflector: facet {facet.id} has z = {z_m:g} m, must lie from {MIN_HEIGHT_SHARE:g} "
-                f"to 1 focal length of {focal_length_m:g} m over the dish vertex: check sign and unit"
-            )
-        if not FACET_FOCAL_SHARES[0] <= share <= FACET_FOCAL_SHARES[1]:
-            problems.append(
-                f"{source}: reflector: facet {facet.id} has focal_length_m = {facet.focal_length_m:g}, must be "
-                f"{FACET_FOCAL_SHARES[0]:g} to {FACET_FOCAL_SHARES[1]:g} of the telescope's {focal_length_m:g} m: "
-                "check the unit, and that it is no radius of curvature"
-            )
-    return problems
-
-
-def _overlaps(config: InstrumentConfig, source: str) -> list[str]:
-    """Facets that stand in each other's place: a position, width or id list is wrong."""
-    pairs = overlapping_facets(reflector_of(config.telescope.focal_length_m, config.facets))
-    return [
-        f"{source}: reflector: facets {first} and {second} overlap by {share:.0%} of a facet, at most "
-        f"{MAX_OVERLAP_SHARE:.0%} pass as error of measurement: check positions, width_m and rotation_deg"
-        for first, second, share in pairs
-        if share > MAX_OVERLAP_SHARE
-    ]
-
-
-def _bad_polygons(config: InstrumentConfig, ids: set[int], source: str) -> list[str]:
-    camera = config.reflector_camera
-    problems = []
-    seen: set[int] = set()
-    for polygon in config.polygons:
-        where = f"{source}: reflector_map: the polygon of facet {polygon.facet_id}"
-        if polygon.facet_id not in ids:
-            problems.append(f"{where}: the reflector has no facet of this id; its ids are {_ranges(ids)}")
-        if polygon.facet_id in seen:
-            problems.append(f"{where} occurs twice; every facet has one outline")
-        seen.add(polygon.facet_id)
-        corners_px = np.array(polygon.corners_px, dtype=np.float64).reshape(-1, 2)
-        fault = polygon_fault(corners_px, camera.columns, camera.rows)
-        if fault is not None:
-            problems.append(f"{where}: {fault}")
-    return problems
-
-
-def _bad_target(config: InstrumentConfig, source: str) -> list[str]:
-    if config.recording is None:
-        return []
-    share = config.recording.brightest_pixel_share
-    cameras = (("star_camera", config.star_camera), ("reflector_camera", config.reflector_camera))
-    return [
-        f"{source}: recording.brightest_pixel_share = {share:g} must be less than {name}.saturation_share = "
-        f"{camera.saturation_share:g}: every frame would be saturated"
-        for name, camera in cameras
-        if share >= camera.saturation_share
-    ]
-
-
-def _ranges(ids: set[int]) -> str:
-    shown = sorted(ids)
-    return ", ".join(map(str, shown)) if len(shown) <= 40 else f"{shown[0]} to {shown[-1]}"

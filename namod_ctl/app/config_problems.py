@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 import types
 import typing
 from typing import Any
@@ -30,19 +31,24 @@ def describe_problems(error: ValidationError, root: type[BaseModel], source: str
     """One text per problem that pydantic found in a config of the sections `root`, in the order of the file's keys."""
     texts: list[str] = []
     explained: set[str] = set()  # missing keys whose misspelt form was found
-    unknown_first = sorted(error.errors(), key=lambda detail: detail["type"] != "extra_forbidden")
+    details = error.errors()
+    inside_wrong = {detail["loc"][:n] for detail in details for n in range(len(detail["loc"]))}
+    unknown_first = sorted(details, key=lambda detail: detail["type"] != "extra_forbidden")
     for detail in unknown_first:
+        if detail["type"] == "too_short" and detail["loc"] in inside_wrong:
+            continue  # its entries with a problem are not counted as entries
         path, model, value_type = _walk(root, detail["loc"])
         key_path = _key_path(path)
         if detail["type"] == "extra_forbidden":
             text, meant = _unknown_key(str(path[-1]), detail["input"], model)
+            text = f": {text}"
             if meant is not None:
                 explained.add(_key_path([*path[:-1], meant]))
         elif detail["type"] == "missing" and key_path in explained:
             continue
         else:
             text = _wrong_value(detail, key_path, value_type)
-        texts.append(f"{source}: {key_path}: {text}" if key_path else f"{source}: {text}")
+        texts.append(f"{source}: {key_path}{text}" if key_path else f"{source}{text}")
     return texts
 
 
@@ -117,27 +123,35 @@ def _unknown_key(key: str, value: Any, section: type[BaseModel]) -> tuple[str, s
 
 
 def _wrong_value(detail: ErrorDetails, key_path: str, value_type: list[Any]) -> str:
-    """What to say about a value, or its absence."""
+    """What to say about a value, or its absence, to follow its key: ` = 80.0 is ...`, `: this key is missing`."""
     kind, value, context = detail["type"], detail["input"], detail.get("ctx", {})
     key = key_path.rsplit(".", 1)[-1].split("[")[0]
     unit = stem_and_unit(key)[1].replace("_", " ")
     in_unit = f" {unit}" if unit else ""
     if kind == "missing":
         what = "section" if any(_is_section(member) for member in value_type) else "key"
-        return f"this {what} is missing{f'; add it, in {unit}' if unit else '; add it'}"
+        return f": this {what} is missing{f'; add it, in {unit}' if unit else '; add it'}"
     if kind == "union_tag_not_found":
-        return "the key kind is missing; add kind = " + " or ".join(_kinds(value_type))
+        return ": the key kind is missing; add kind = " + " or ".join(_kinds(value_type))
     if kind == "union_tag_invalid":
-        return f"kind = {context.get('tag')!r} is unknown; known are {' and '.join(_kinds(value_type))}"
+        return f".kind = {context.get('tag')!r} is unknown; known are {' and '.join(_kinds(value_type))}"
+    if kind == "value_error":
+        text = str(context["error"])
+        return f"{_joint(text)}{text}"
     if kind in ("greater_than_equal", "less_than_equal"):
         side, limit = ("at least", context["ge"]) if kind == "greater_than_equal" else ("at most", context["le"])
         remedy = f"check sign and unit, {unit} is expected" if unit else "correct it"
-        return f"{_shown(value)} is not plausible, must be {side} {limit:g}{in_unit}: {remedy}"
+        return f" = {_shown(value)} is not plausible, must be {side} {limit:g}{in_unit}; {remedy}"
     if kind == "finite_number":
-        return f"{_shown(value)} is no finite number; give one{f' in {unit}' if unit else ''}"
-    if kind == "value_error":
-        return str(context["error"])
-    return f"{_shown(value)} does not fit: {detail['msg'][0].lower()}{detail['msg'][1:]}"
+        return f" = {_shown(value)} is no finite number; give one{f' in {unit}' if unit else ''}"
+    return f" = {_shown(value)} does not fit; the {detail['msg'][0].lower()}{detail['msg'][1:]}"
+
+
+def _joint(text: str) -> str:
+    """Between a key and what a rule of its section says: which begins with a key of the section, or with the value."""
+    if re.match(r"\w+ = ", text):
+        return "."
+    return " = " if text[:1] in "['" else ": "
 
 
 def _shown(value: Any) -> str:

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from namod_ctl.app.actuator_schema import ActuatorsSection
+from namod_ctl.app.camera_schema import DeviceSection
 from namod_ctl.app.config_section import FacetId, FileName, Name, Section, within
 
 AngleDeg = Annotated[float, within(-360.0, 360.0)]
@@ -170,6 +171,7 @@ class _CameraSection(Section):
     full_scale_adu: Annotated[float, within(1.0, 65_535.0)]
     saturation_share: Annotated[float, within(0.5, 1.0)]
     radiometric_law: RadiometricLawSection
+    device: DeviceSection | None = None
 
     @model_validator(mode="after")
     def _axis_is_in_image(self) -> _CameraSection:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from namod_ctl.app.actuator_summary import actuator_rows, actuator_warnings
 from namod_ctl.app.config import InstrumentConfig
 from namod_ctl.app.config_schema import LegsMountSection, ReflectorCameraSection, StarCameraSection, TripodMountSection
+from namod_ctl.app.number_ranges import runs_in_words
 from namod_ctl.core.units import m2_to_cm2, rad_to_deg
 from namod_ctl.optics.camera_model import CameraModel
 from namod_ctl.optics.instrument import Instrument
@@ -51,7 +52,7 @@ def warnings_of(config: InstrumentConfig, instrument: Instrument) -> list[str]:
         )
     unmapped = [facet_id for facet_id in instrument.reflector.ids if facet_id not in instrument.facet_polygons_px]
     if instrument.facet_polygons_px and unmapped:
-        warnings.append(f"facets without an outline in the reflector camera's image: {_id_list(unmapped)}")
+        warnings.append(f"facets without an outline in the reflector camera's image: {runs_in_words(unmapped)}")
     if not instrument.facet_polygons_px:
         warnings.append("no map of facets (reflector_map): images cannot be measured, only response maps imported")
     seen_deg, view_deg = _reflector_angle_deg(instrument), _view_deg(instrument.reflector_camera)
@@ -78,7 +79,7 @@ def _telescope_rows(config: InstrumentConfig, instrument: Instrument) -> tuple[t
     return (
         ("focal length", f"{focal_length_m:g} m"),
         ("facets", f"{len(facets)}, {', '.join(kinds)} {across}"),
-        ("ids", _id_list(list(instrument.reflector.ids))),
+        ("ids", runs_in_words(instrument.reflector.ids)),
         ("facet area", _span([m2_to_cm2(facet_area_m2(facet)) for facet in facets], "cm2", ".1f")),
         ("facet focal length", _span(focal_lengths_m, "m", ".4g")),
         ("mirror area", f"{area_m2:.4g} m2, as a disc of {equal_area_m:.4g} m (F/{focal_length_m / equal_area_m:.2f})"),
@@ -178,20 +179,6 @@ def _compass(angle_deg: float) -> str:
 def _span(values: list[float], unit: str, form: str) -> str:
     low, high = format(min(values), form), format(max(values), form)
     return f"{low} {unit}" if low == high else f"{low} to {high} {unit}"
-
-
-def _id_list(ids: list[int]) -> str:
-    """Ids with runs drawn together: `0, 2 to 7, 10`."""
-    runs: list[list[int]] = []
-    for facet_id in sorted(ids):
-        if runs and facet_id == runs[-1][-1] + 1:
-            runs[-1].append(facet_id)
-        else:
-            runs.append([facet_id])
-    return ", ".join(
-        str(run[0]) if len(run) == 1 else f"{run[0]}, {run[1]}" if len(run) == 2 else f"{run[0]} to {run[-1]}"
-        for run in runs
-    )
 
 
 def _outer_radius_m(instrument: Instrument) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -30,6 +31,7 @@ PSF_SUM_FILE = "psf_sum.png"
 
 _MOST_LABELS = 60
 _FAR_LABEL_PT = 10.0
+_LETTERS_PER_IN = 14.0  # of the footer's size, about
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,13 +137,14 @@ def draw_psf_sum(panels: Sequence[PsfPanel], telescope: str, limit: AreaOfPsf | 
     reach = [_reach_arcmin(panel) for panel in panels]
     lowest, highest = np.min([low for low, _ in reach], axis=0), np.max([high for _, high in reach], axis=0)
     panel_in = 5.4
-    size_in = (0.9 + panel_in * len(panels) + 1.0, 7.0)
+    size_in = (0.9 + panel_in * len(panels) + 1.0, 6.85)
+    bottom, height = 0.94 / size_in[1], (panel_in - 0.36) / size_in[1]
     figure = Figure(figsize=size_in, dpi=DPI, facecolor="white")
     densities = [_density(panel) for panel in panels]
     norm = PowerNorm(0.5, vmin=0.0, vmax=max(float(np.nanmax(density)) for density in densities))
     for number, (panel, density) in enumerate(zip(panels, densities, strict=True)):
         left = (0.8 + panel_in * number) / size_in[0]
-        axes = figure.add_axes((left, 0.12, (panel_in - 0.35) / size_in[0], 0.72))
+        axes = figure.add_axes((left, bottom, (panel_in - 0.35) / size_in[0], height))
         mesh = axes.pcolormesh(
             rad_to_arcmin(panel.x_centres_rad), rad_to_arcmin(panel.y_centres_rad), density,
             cmap=colours(), norm=norm, shading="nearest",
@@ -157,12 +160,14 @@ def draw_psf_sum(panels: Sequence[PsfPanel], telescope: str, limit: AreaOfPsf | 
         else:
             axes.tick_params(labelleft=False)
         axes.set_title(f"{panel.title}\nA_sigma = {_area_text(panel.area)}", fontsize=11)
-    bar = figure.colorbar(mesh, cax=figure.add_axes((1.0 - 0.85 / size_in[0], 0.12, 0.18 / size_in[0], 0.72)))
+    bar = figure.colorbar(mesh, cax=figure.add_axes((1.0 - 0.85 / size_in[0], bottom, 0.18 / size_in[0], height)))
     bar.set_label("share of all light per arcmin², square-root scale")
-    figure.text(0.8 / size_in[0], 0.965, f"{telescope}: point spread function of the whole reflector", fontsize=12)
+    title = f"{telescope}: point spread function of the whole reflector"
+    figure.text(0.8 / size_in[0], 1.0 - 0.12 / size_in[1], title, fontsize=12, va="top")
     footer = "Ellipse: one standard deviation of the light; its area is A_sigma."
     if limit is not None:
         footer += f"  Ray-traced limit of perfectly aligned facets without figure errors: {_area_text(limit)}."
+    footer = textwrap.fill(footer, int(_LETTERS_PER_IN * (size_in[0] - 0.9)))
     figure.text(0.8 / size_in[0], 0.015, footer, fontsize=9)
     return figure
 

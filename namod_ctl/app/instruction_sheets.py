@@ -10,6 +10,7 @@ import io
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import date
 from typing import Literal
 
 import numpy as np
@@ -82,16 +83,20 @@ def _to_view(seen_from: Literal["front", "back"]) -> Array:
     return np.array([-1.0 if seen_from == "back" else 1.0, 1.0])
 
 
-def sheets_to_pdf(instrument: Instrument, instructions: Sequence[FacetInstruction], headline: str) -> bytes:
+def sheets_to_pdf(
+    instrument: Instrument, instructions: Sequence[FacetInstruction], headline: str, written_on: date
+) -> bytes:
     """The PDF with all sheets; one page that says so where no facet has bolts."""
     data = io.BytesIO()
     with PdfPages(data, metadata={"Title": headline, "Creator": "namod-ctl"}) as pdf:
-        for page in _pages(instrument, instructions, headline):
+        for page in _pages(instrument, instructions, headline, written_on):
             pdf.savefig(page)
     return data.getvalue()
 
 
-def _pages(instrument: Instrument, instructions: Sequence[FacetInstruction], headline: str) -> Iterator[Figure]:
+def _pages(
+    instrument: Instrument, instructions: Sequence[FacetInstruction], headline: str, written_on: date
+) -> Iterator[Figure]:
     if all(instruction.verdict is Verdict.NO_BOLTS for instruction in instructions):
         page, axes = _blank_page()
         _write(axes, _LEFT_MM, 270.0, headline, 13, weight="bold")
@@ -106,6 +111,7 @@ def _pages(instrument: Instrument, instructions: Sequence[FacetInstruction], hea
     for number, sheet in enumerate(sheets, start=1):
         page, axes = _blank_page()
         _draw_header(axes, instrument, headline, f"Sheet {number} of {len(sheets)} · ladder place {sheet.place}")
+        _draw_signature(axes, written_on)
         _draw_key_map(page, outlines, sheet)
         _draw_table(axes, instrument, [by_id[facet_id] for facet_id in sheet.facet_ids])
         yield page
@@ -145,6 +151,15 @@ def _draw_header(axes: Axes, instrument: Instrument, headline: str, sheet_name: 
         "Turn all bolts of a facet, then tick it. Map: black facets are on this sheet.",
     ]
     _write(axes, _LEFT_MM, 226.0, "\n".join(textwrap.fill(line, 68) for line in lines), 8.5, linespacing=1.2)
+
+
+def _draw_signature(axes: Axes, written_on: date) -> None:
+    """At the foot of the sheet: when it was written, and room for who turned and when."""
+    y_mm = 8.0
+    _write(axes, _LEFT_MM, y_mm, f"Written {written_on.isoformat()}", 9, va="center")
+    for x_mm, name, end_mm in ((62.0, "Turned by", 128.0), (134.0, "Date, time", _RIGHT_MM)):
+        _write(axes, x_mm, y_mm, name, 9, va="center")
+        axes.plot([x_mm + 18.0, end_mm], [y_mm - 2.0, y_mm - 2.0], color="black", lw=0.8)
 
 
 def _draw_key_map(page: Figure, outlines: Mapping[int, Array], sheet: Sheet) -> None:
@@ -213,8 +228,8 @@ def _draw_row(
         _write(axes, _LEFT_MM + 50.0, middle_mm, "ok: no turn needed", 15, va="center", weight="bold")
     else:
         column_mm = (_RIGHT_MM - 14.0 - _LEFT_MM - 48.0) / _BOLTS_PER_LINE
-        n_lines = -(-len(instruction.turns_deg) // _BOLTS_PER_LINE)
-        for bolt, turn_deg in enumerate(instruction.turns_deg):
+        n_lines = -(-len(instruction.settable_deg) // _BOLTS_PER_LINE)
+        for bolt, turn_deg in enumerate(instruction.settable_deg):
             line, column = divmod(bolt, _BOLTS_PER_LINE)
             x_mm = _LEFT_MM + 48.0 + column * column_mm
             share = 1.0 if n_lines == 1 else 0.86  # of the row; below two lines a note still finds room
@@ -233,7 +248,7 @@ _NOTE_OF_FLAG = {
 }
 
 
-def _draw_turn(axes: Axes, x_mm: float, y_mm: float, bolt: int, turn_deg: int, mount: Mount, scale: float) -> None:
+def _draw_turn(axes: Axes, x_mm: float, y_mm: float, bolt: int, turn_deg: float, mount: Mount, scale: float) -> None:
     """One bolt: its number, an arrow round it the way it is turned, and size and sense in words, whole turns apart."""
     radius_mm = _ARROW_RADIUS_MM * scale
     centre = np.array([x_mm + radius_mm, y_mm])
@@ -267,11 +282,11 @@ def _draw_round_arrow(axes: Axes, centre: Array, radius_mm: float, *, is_clockwi
     axes.add_patch(Polygon(np.array(corners), closed=True, fc="black", ec="none"))
 
 
-def turn_in_words(turn_deg: int) -> str:
+def turn_in_words(turn_deg: float) -> str:
     """A turn as people count it: `285°`, `1 turn + 52°`, `2 turns`."""
     whole, rest_deg = divmod(turn_deg, 360)
-    turns = f"{whole} turn{'s' if whole > 1 else ''}" if whole else ""
-    return " + ".join(part for part in (turns, f"{rest_deg}°" if rest_deg or not whole else "") if part)
+    turns = f"{whole:g} turn{'s' if whole > 1 else ''}" if whole else ""
+    return " + ".join(part for part in (turns, f"{rest_deg:g}°" if rest_deg or not whole else "") if part)
 
 
 def _draw_arms(axes: Axes, legs_m: Array, centre_mm: Array, size_mm: float) -> None:

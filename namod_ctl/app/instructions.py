@@ -15,6 +15,7 @@ from namod_ctl.core.units import rad_to_deg
 from namod_ctl.reconstruction.alignment import Alignment, FacetAlignment
 
 CSV_FILE = "instructions.csv"
+_SETTABLE_DECIMALS = 6
 NO_TURN_NEEDED = "NO_TURN_NEEDED"  # stands among the flags of instructions.csv
 
 
@@ -35,7 +36,9 @@ class FacetInstruction:
     ----------
     turns_deg
         Whole degrees per bolt, positive raises the leg (towards the sky). Empty where nobody should turn, and
-        where there are no bolts. Where no turn is needed it holds the turns too small to be made.
+        where there are no bolts. Where no turn is needed it holds the turns too small to be made. For programs.
+    settable_deg
+        The same turns as a person can set them: multiples of what the goniometer resolves. For people.
     flags
         Names for machines: those of the facet's flags, then NO_TURN_NEEDED where it holds.
     reasons
@@ -45,6 +48,7 @@ class FacetInstruction:
     facet_id: int
     verdict: Verdict
     turns_deg: tuple[int, ...]
+    settable_deg: tuple[float, ...]
     flags: tuple[str, ...]
     reasons: tuple[str, ...]
 
@@ -54,19 +58,27 @@ def facet_instructions(alignment: Alignment, goniometer_resolution_rad: float) -
 
     No turn is needed when every bolt is within half the goniometer's resolution: turning it could not improve it.
     """
-    smallest_turn_deg = 0.5 * rad_to_deg(goniometer_resolution_rad)
-    return tuple(_instruct(facet, smallest_turn_deg) for facet in alignment.facets)
+    step_deg = rad_to_deg(goniometer_resolution_rad)
+    return tuple(_instruct(facet, step_deg) for facet in alignment.facets)
 
 
-def _instruct(facet: FacetAlignment, smallest_turn_deg: float) -> FacetInstruction:
-    verdict = _verdict(facet, smallest_turn_deg)
+def settable_turn_deg(turn_deg: float, step_deg: float) -> float:
+    """The turn nearest to `turn_deg` that a goniometer with marks every `step_deg` can show."""
+    # the sum with 0 makes -0 a 0; steps such as 0.1 are no exact numbers
+    return round(round(turn_deg / step_deg) * step_deg, _SETTABLE_DECIMALS) + 0.0
+
+
+def _instruct(facet: FacetAlignment, step_deg: float) -> FacetInstruction:
+    verdict = _verdict(facet, 0.5 * step_deg)
     is_stated = verdict in (Verdict.TURN, Verdict.NO_TURN_NEEDED)
     flags = facet.flags.names + ((NO_TURN_NEEDED,) if verdict is Verdict.NO_TURN_NEEDED else ())
     meanings = tuple(meaning for flag, meaning in FACET_FLAG_MEANING.items() if flag in facet.flags)
     if verdict is Verdict.DO_NOT_TURN and not facet.flags.forbids_turning:
         meanings += ("no correction could be computed",)
-    turns_deg = tuple(round(float(turn_deg)) for turn_deg in facet.bolt_turn_deg) if is_stated else ()
-    return FacetInstruction(facet.facet_id, verdict, turns_deg, flags, meanings + facet.remarks)
+    wanted_deg = [float(turn_deg) for turn_deg in facet.bolt_turn_deg] if is_stated else []
+    turns_deg = tuple(map(round, wanted_deg))
+    settable_deg = tuple(settable_turn_deg(turn_deg, step_deg) for turn_deg in wanted_deg)
+    return FacetInstruction(facet.facet_id, verdict, turns_deg, settable_deg, flags, meanings + facet.remarks)
 
 
 def _verdict(facet: FacetAlignment, smallest_turn_deg: float) -> Verdict:

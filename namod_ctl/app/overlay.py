@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
-from matplotlib.patches import Circle
+from matplotlib.patches import Circle, Rectangle
 from matplotlib.patheffects import withStroke
 from matplotlib.textpath import TextPath
 from numpy.typing import NDArray
@@ -31,6 +31,7 @@ Image = NDArray[np.uint8]
 PNG_FILE = "instructions.png"
 
 _RED, _ID_RED, _GREEN, _YELLOW, _WHITE = "#ff2020", "#ff8080", "#b4ffb4", "#ffe600", "#ffffff"
+_CANVAS = "#181818"  # without a picture
 _BOLD = FontProperties(family="DejaVu Sans", weight="bold")  # ships with matplotlib: the same on every machine
 _DPI = 72  # one point of text is one pixel
 
@@ -99,7 +100,7 @@ def draw_instructions(
     size = (n_columns * zoom, n_rows * zoom)
     facets = locate_facets(instrument, scale_polygons(polygons_px, (n_columns, n_rows), size))
 
-    legend_px = max(60, size[1] // 14)
+    legend_px = max(75, size[1] // 12)
     figure, axes = _canvas(size, legend_px, image)
     is_legible = float(np.median([facet.width_px for facet in facets])) >= _SMALLEST_FACET_WIDTH_PX
     by_id = {instruction.facet_id: instruction for instruction in instructions}
@@ -123,8 +124,9 @@ def _canvas(size: tuple[int, int], legend_px: int, image: Image | None) -> tuple
     axes = figure.add_axes((0.0, legend_px / height, 1.0, n_rows / height))
     extent = (-0.5, n_columns - 0.5, n_rows - 0.5, -0.5)
     if image is None:
-        image = np.full((2, 2, 3), 24, dtype=np.uint8)
-    axes.imshow(image, extent=extent, interpolation="bilinear", aspect="auto")
+        axes.add_patch(Rectangle((-0.5, -0.5), n_columns, n_rows, fc=_CANVAS, ec="none"))
+    else:
+        axes.imshow(image, extent=extent, interpolation="bilinear", aspect="auto")
     axes.set_xlim(extent[0], extent[1])
     axes.set_ylim(extent[2], extent[3])
     axes.set_axis_off()
@@ -218,7 +220,7 @@ def _draw_turns(axes: Axes, facet: FacetInPicture, instruction: FacetInstruction
         axes.add_patch(Circle((end[0], end[1]), _BOLT_RADIUS * width_px, fc=_GREEN, ec="black", lw=line_px, zorder=3))
         _write(axes, end, str(bolt + 1), 1.15 * _BOLT_SIZE * width_px, "black", outline=_GREEN)
 
-    turns = [f"{turn_deg:+d}°".replace("-", "−") for turn_deg in instruction.turns_deg]
+    turns = [f"{turn_deg:+g}°".replace("-", "−") if turn_deg else "leave" for turn_deg in instruction.settable_deg]
     for shrink in (1.0, 0.9, 0.8, 0.7, 0.6, 0.5):
         placed = _place_texts(facet, ends, arms, turns, shrink)
         if placed is not None:
@@ -288,30 +290,31 @@ def _legend_lines(
     instrument: Instrument, by_id: Mapping[int, FacetInstruction], headline: str, is_legible: bool
 ) -> list[str]:
     senses = {mount.turn_raises_leg for mount in instrument.mounts.values()}
-    sense = f"+ is {senses.pop()}" if len(senses) == 1 else "the sense of + differs between facets: see the sheets"
-    if all(instruction.verdict is Verdict.NO_BOLTS for instruction in by_id.values()):
+    sense = f"+ is {senses.pop()}" if len(senses) == 1 else "the sense of + differs between facets (see the sheets)"
+    has_bolts = any(instruction.verdict is not Verdict.NO_BOLTS for instruction in by_id.values())
+    if not has_bolts:
         explanation = "This telescope has no bolts: its legs are driven, see leg_travel_m in alignment.json."
     elif is_legible:
         explanation = (
-            f"Turn the bolt (number in a disc) by the degrees beside it, {sense}.   Framed: facet.   "
-            "ok: no turn needed.   White broken frame: do not turn."
+            "Turn the bolt (number in a disc) by the degrees beside it.   Framed: facet.   "
+            "ok, leave: no turn needed.   White broken frame: do not turn."
         )
     else:
         explanation = (
             "Facets are too small in this picture for numbers: read them in instructions.pdf or instructions.csv.   "
             "White broken frame: do not turn."
         )
-    side = (
-        "Seen from the focal point: behind the mirror left and right are exchanged."
-        if instrument.bolts_seen_from == "back"
-        else "Seen from the focal point."
-    )
-    return [headline, f"{explanation}   {side}"]
+    side = "The picture is seen from the FRONT of the mirror, from its focal point. "
+    if has_bolts and instrument.bolts_seen_from == "back":
+        side += f"Bolts are turned from BEHIND it: there left and right are exchanged, and {sense} as you see the bolt."
+    elif has_bolts:
+        side += f"Bolts are turned from the FRONT, too: {sense} as you see the bolt."
+    return [headline, explanation, side]
 
 
 def _draw_legend(figure: Figure, size: tuple[int, int], legend_px: int, lines: Sequence[str]) -> None:
     longest_em = max(_text_size_em(line)[0] for line in lines)
-    size_px = min(0.3 * legend_px, 0.97 * size[0] / longest_em)
+    size_px = min(0.75 * legend_px / len(lines), 0.97 * size[0] / longest_em)
     for line, text in enumerate(lines):
-        y = (0.72 - 0.46 * line) * legend_px / (size[1] + legend_px)
+        y = (1.0 - (line + 0.5) / len(lines)) * legend_px / (size[1] + legend_px)
         figure.text(0.01, y, text, color=_WHITE, fontsize=size_px, fontproperties=_BOLD, va="center")

@@ -112,6 +112,21 @@ def ms_to_s(time_ms: T) -> T:
     return time_ms / 1000.0
 
 
+def s_to_ms(time_s: T) -> T:
+    """Seconds as milliseconds (exposures and timeouts of camera libraries)."""
+    return time_s * 1000.0
+
+
+def us_to_s(time_us: T) -> T:
+    """Microseconds (exposures of cameras) as seconds."""
+    return time_us / 1.0e6
+
+
+def s_to_us(time_s: T) -> T:
+    """Seconds as microseconds (exposures of cameras)."""
+    return time_s * 1.0e6
+
+
 def celsius_to_k(temperature_celsius: T) -> T:
     """Degrees Celsius (drives' thermometers) as kelvins."""
     return temperature_celsius + 273.15

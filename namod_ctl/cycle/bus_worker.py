@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from typing import TypeVar
@@ -39,6 +39,11 @@ Answer = TypeVar("Answer")
 class BusWorker:
     """The thread of one bus and what it has to do.
 
+    Parameters
+    ----------
+    drives
+        Those of the bus, by their legs.
+
     Attributes
     ----------
     courses
@@ -51,13 +56,14 @@ class BusWorker:
     def __init__(
         self,
         bus: Bus,
+        drives: Mapping[Leg, Drive],
         courses: Sequence[Course],
         clock: MonotonicClock,
         switch: StopSwitch,
         broken_facets: dict[int, str],
     ) -> None:
         self.bus = bus
-        self.drives = bus.drives
+        self.drives = drives
         self.courses = tuple(courses)
         self.broken_facets = broken_facets
         self._clock, self._switch = clock, switch

@@ -9,17 +9,18 @@ from __future__ import annotations
 from dataclasses import replace
 
 from namod_ctl.core.clock import Clock
-from namod_ctl.core.errors import DataQualityError, NamodError, SafetyStop
+from namod_ctl.core.errors import ConfigError, DataQualityError, NamodError, SafetyStop
 from namod_ctl.core.motion import StopSwitch
 from namod_ctl.cycle.campaign_memory import alignments_on_record, cycle_to_record, history_of, note_forecast
 from namod_ctl.cycle.campaign_parts import CampaignSettings, Outside, View
-from namod_ctl.cycle.control import ControlBox, Request, RequestKind
+from namod_ctl.cycle.control import OF_FACETS, ControlBox, Request, RequestKind
 from namod_ctl.cycle.convergence import Decision, decide
 from namod_ctl.cycle.correct import Corrector, StopAsked
 from namod_ctl.cycle.machine import FINAL, CampaignMachine
 from namod_ctl.cycle.plan import Plan
 from namod_ctl.cycle.progress import Progress
 from namod_ctl.cycle.record import Recorder, StopRule
+from namod_ctl.cycle.turn_marks import FacetIds, left, unmark
 from namod_ctl.optics.instrument import Instrument
 from namod_ctl.reconstruction.alignment import Alignment
 from namod_ctl.reconstruction.reconstruct import Reconstruction, reconstruct
@@ -38,6 +39,9 @@ MIN_COVERAGE = 0.8
 
 LISTENING = frozenset({"recording", "paused", "awaiting_approval", "awaiting_operator"})
 """States that answer requests themselves."""
+
+
+_TOO_LATE = "not possible now: somebody has stopped it"
 
 
 class Campaign:
@@ -94,10 +98,8 @@ class Campaign:
                 getattr(self, f"_in_{state}")()
                 if state not in LISTENING and self.state not in LISTENING:
                     self._poll()
-        except StopAsked as stop:
+        except (StopAsked, SafetyStop, DataQualityError) as stop:
             self._hold(str(stop))
-        except (SafetyStop, DataQualityError) as error:
-            self._hold(str(error))
         except KeyboardInterrupt as stop:
             self._hold(f"stopped by {stop}" if str(stop) else "stopped by Ctrl-C")
             raise
@@ -126,8 +128,7 @@ class Campaign:
     def _in_recording(self) -> None:
         cycle = cycle_to_record(self._store)
         with self._run_of(cycle) as run:
-            equipment = self._outside.equipment()
-            recorder = Recorder(equipment, self._instrument, run, self._settings.record)
+            recorder = Recorder(self._outside.equipment(), self._instrument, run, self._settings.record)
 
             def on_progress(progress: Progress) -> None:
                 self._view.recording(cycle.number, progress)
@@ -174,9 +175,8 @@ class Campaign:
             alignment_json=self._outside.alignment_to_json(result.alignment),
         )
         note_forecast(self._store, cycle.number, plan)
-        decision, why = decide(
-            history_of(self._store, cycle, plan), self._settings.limit_rad2, self._settings.max_cycles
-        )
+        history = history_of(self._store, cycle, plan)
+        decision, why = decide(history, self._settings.limit_rad2, self._settings.max_cycles)
         if decision is Decision.VAGUE:
             self._record_again(why)
             return
@@ -252,8 +252,7 @@ class Campaign:
             self._plan = None
             self._machine.fire("changed", changed)
             return
-        self._n_changed = 0
-        plan, self._plan = self._plan, None
+        plan, self._plan, self._n_changed = self._plan, None, 0
         summary = self._corrector.carry_out(self._store.cycles()[-1].number, plan, self._poll)
         self._machine.fire("corrected", summary)
 
@@ -271,15 +270,12 @@ class Campaign:
 
     def _in_awaiting_operator(self) -> None:
         for request in self._requests():
-            if request.kind is RequestKind.DONE:
-                answer = self._corrector.mark_done(request.facet_ids)
-                self._control.answer(request, answer)
-                self._view.told(answer)
+            if request.kind in OF_FACETS:
+                self._mark(request.facet_ids, request)
             else:
                 self._refuse(request)
-        marked = self._view.turned()
-        if marked:
-            self._view.told(self._corrector.mark_done(marked))
+        if marked := self._view.turned():
+            self._mark(marked)
         if self._corrector.is_done():
             self._plan = None
             self._machine.fire("done", "all facets are marked as done")
@@ -290,9 +286,20 @@ class Campaign:
 
     def _remind(self) -> None:
         """People who turn bolts: where their sheets are, and what is left."""
-        for event in [event for event in self._store.events() if event.kind == "instructions"][-1:]:
-            self._view.told(event.text)
-        self._view.told(self._corrector.mark_done(()))
+        where = [event.text for event in self._store.events() if event.kind == "instructions"][-1:]
+        for text in [*where, left(self._store)]:
+            self._view.told(text)
+
+    def _mark(self, facet_ids: FacetIds, request: Request | None = None) -> None:
+        """Write down what people say of their bolts, or take it back, and answer the request it came with."""
+        is_undo, is_accepted = request is not None and request.kind is RequestKind.NOT_DONE, True
+        try:
+            answer = unmark(self._store, facet_ids) if is_undo else self._corrector.mark_done(facet_ids)
+        except ConfigError as error:
+            answer, is_accepted = str(error), False
+        if request is not None:
+            self._control.answer(request, answer, is_accepted=is_accepted)
+        self._view.told(answer)
 
     def _learn_again(self) -> None:
         """After a restart: what the corrections so far have taught, in the two last steps of before.
@@ -325,9 +332,8 @@ class Campaign:
         path = self._store.run_path(cycle.number)
         if path.exists():
             return RunStore.open(path, read_only=False)
-        facet_ids = self._instrument.reflector.ids
         source = f"cycle {cycle.number} of {self._store.path.name}"
-        return RunStore.create(path, facet_ids, self._store.config_json, source, self._clock)
+        return RunStore.create(path, self._instrument.reflector.ids, self._store.config_json, source, self._clock)
 
     def _reconstructed(self, cycle: Cycle) -> Reconstruction:
         path = self._store.run_path(cycle.number)
@@ -356,14 +362,12 @@ class Campaign:
         requests = self._control.poll()
         for complaint in self._control.complaints():
             self._tell("control", complaint)
-        stops = [request for request in requests if request.kind is RequestKind.STOP]
-        if stops:
+        if stops := [request for request in requests if request.kind is RequestKind.STOP]:
             self._switch.throw("stopped by `namod-ctl stop`")
             for request in requests:
-                if request in stops:
-                    self._control.answer(request, "stopping: the campaign is held until somebody releases it")
-                else:
-                    self._control.answer(request, "not possible now: somebody has stopped it", is_accepted=False)
+                is_stop = request in stops
+                text = "stopping: the campaign is held until somebody releases it" if is_stop else _TOO_LATE
+                self._control.answer(request, text, is_accepted=is_stop)
             raise StopAsked(self._switch.reason)
         return requests
 
@@ -373,9 +377,8 @@ class Campaign:
             self._refuse(request)
 
     def _refuse(self, request: Request) -> None:
-        self._control.answer(
-            request, f"not possible now: {request.kind.value} means nothing in state {self.state}", is_accepted=False
-        )
+        why = f"not possible now: {request.kind.replace('_', ' ')} means nothing in state {self.state}"
+        self._control.answer(request, why, is_accepted=False)
 
     def _hold(self, reason: str) -> None:
         """Stop all motion, then journal it: in this order, as the disk may be the trouble."""

@@ -43,8 +43,10 @@ class RequestKind(StrEnum):
     REFUSE = "refuse"
     RELEASE = "release"
     DONE = "done"
+    NOT_DONE = "not_done"
 
 
+OF_FACETS = frozenset({RequestKind.DONE, RequestKind.NOT_DONE})
 _ABOUT_THIS_MOMENT = frozenset({RequestKind.APPROVE, RequestKind.RELEASE})
 
 
@@ -54,7 +56,8 @@ class Request(BaseModel):
     Attributes
     ----------
     facet_ids
-        Of a `done`: the facets whose bolts were turned, or "all"; empty for every other kind.
+        Of a `done`: the facets whose bolts were turned, or "all"; of a `not_done` those of which that was said by
+        mistake. Empty for every other kind.
     id
         Unique; names the file of the answer.
     """
@@ -67,7 +70,7 @@ class Request(BaseModel):
 
     @model_validator(mode="after")
     def _check_facets(self) -> Request:
-        if (self.kind is RequestKind.DONE) != bool(self.facet_ids):
+        if (self.kind in OF_FACETS) != bool(self.facet_ids):
             raise ValueError(f"a request to {self.kind} with facets {self.facet_ids!r}")
         return self
 

@@ -66,7 +66,10 @@ class Corrector(Protocol):
         ...
 
     def mark_done(self, facet_ids: Sequence[int] | Literal["all"]) -> str:
-        """People say that they have turned these facets; an answer for them."""
+        """People say that they have turned these facets; an answer for them.
+
+        Raises ConfigError, and writes nothing, when turns of one of them were not asked for.
+        """
         ...
 
     def is_done(self) -> bool:

@@ -11,11 +11,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.flags import FACET_FLAG_MEANING, FacetFlag
 from namod_ctl.core.units import rad_to_deg
 from namod_ctl.cycle.manual import TurnKind, check_turns
 from namod_ctl.cycle.plan import Plan, forecast
+from namod_ctl.cycle.turn_marks import mark
 from namod_ctl.optics.instrument import Instrument
 from namod_ctl.reconstruction.alignment import Alignment, FacetAlignment
 from namod_ctl.reconstruction.reconstruct import Reconstruction, turning_cov_rad2
@@ -129,15 +129,10 @@ class ManualCorrector:
         return self._write_sheets(run, self._result.alignment)
 
     def mark_done(self, facet_ids: Sequence[int] | Literal["all"]) -> str:
-        """Mark facets; the answer says how many are left."""
-        try:
-            newly = self._store.mark_done(None if facet_ids == "all" else [int(facet_id) for facet_id in facet_ids])
-        except ConfigError as error:
-            return str(error)
+        """Mark facets; the answer names them, and those that are left."""
+        answer = mark(self._store, facet_ids)
         self._tell_of_marks()
-        left = [turns.facet_id for turns in self._store.turns() if not turns.is_done]
-        rest = "all are done" if not left else f"{len(left)} to go: {', '.join(map(str, left))}"
-        return f"{len(newly)} facets marked; {rest}"
+        return answer
 
     def is_done(self) -> bool:
         """Are all facets that were asked for marked?"""
@@ -147,7 +142,10 @@ class ManualCorrector:
         """Nothing moves by itself."""
 
     def _tell_of_marks(self) -> None:
-        """Tell `on_done` of marked facets, of each at most once: a kill in between must not turn a bolt twice."""
+        """Tell `on_done` of marked facets, of each at most once.
+
+        Neither a kill in between turns a bolt twice, nor a mark that is taken back and made again.
+        """
         marked = [turns for turns in self._store.turns() if turns.is_done]
         if not marked:
             return

@@ -46,6 +46,16 @@ class Coverage:
         """Share of the region's cells that have a record."""
         return float(np.mean(self.counts[self.is_inside] > 0))
 
+    @property
+    def has_hole(self) -> bool:
+        """Are there two by two empty cells side by side in the region?
+
+        Facets that throw their light there are hardly seen, however well the rest is covered; and once the facets have
+        been aligned, all of them throw it into one place.
+        """
+        dark = self.is_inside & (self.counts == 0)
+        return bool(np.any(dark[1:, 1:] & dark[1:, :-1] & dark[:-1, 1:] & dark[:-1, :-1]))
+
 
 def empty_coverage(radius_rad: float) -> Coverage:
     """The coverage of a recording that has no records yet."""

@@ -3,14 +3,15 @@
 In a process of its own at low priority, so that neither the cameras nor the reduction wait for it. It reads the
 run from the disk; it is asked again when the run has grown by a fifth.
 
-It is what `reconstruct` would say, without what the crew does not look at (corrections, areas, ray tracing). And it
-remembers what changes slowly from one estimate to the next: which records are bad, and how much worse random
-halves of the run agree than they should (`uncertainty.repetition_factor`). That needs the fits of several pairs of
-halves; here every estimate makes one pair, of half of the facets, and pools it with those of the estimates before.
+It is what `reconstruct` would say, without what the crew does not look at meanwhile (corrections, histograms, ray
+tracing). And it remembers what changes slowly from one estimate to the next: which records are bad, and how much worse
+random halves of the run agree than they should (`uncertainty.repetition_factor`). That needs the fits of several pairs
+of halves; here every estimate makes one pair, of half of the facets, and pools it with those of the estimates before.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 from collections import deque
@@ -27,8 +28,10 @@ from numpy.typing import NDArray
 from namod_ctl.core.errors import DataQualityError, NamodError
 from namod_ctl.core.flags import FacetFlag
 from namod_ctl.optics.instrument import Instrument
+from namod_ctl.reconstruction.alignment import AreaOfPsf
 from namod_ctl.reconstruction.bad_records import find_bad_records
-from namod_ctl.reconstruction.facet_fit import centre_covariance
+from namod_ctl.reconstruction.facet_fit import FacetFit, centre_covariance
+from namod_ctl.reconstruction.psf import area_now
 from namod_ctl.reconstruction.quality import ScanRegion, judge_fit
 from namod_ctl.reconstruction.reconstruct import MIN_RECORDS, expected_size_rad
 from namod_ctl.reconstruction.responses import ResponseTable, tabulate_responses
@@ -61,12 +64,16 @@ class LiveEstimate:
         That facet.
     unseen_facet_ids
         Facets that showed no light in any record (NO_SIGNAL): nothing is known about them.
+    a_sigma_rad2, a_sigma_uncertainty_rad2
+        Area of the light of all facets that shine, see `reconstruction.psf.area_now`; NaN when none does.
     """
 
     n_records: int
     worst_uncertainty_rad: float
     worst_facet_id: int
     unseen_facet_ids: tuple[int, ...]
+    a_sigma_rad2: float = math.nan
+    a_sigma_uncertainty_rad2: float = math.nan
 
 
 class LiveEstimator:
@@ -155,18 +162,25 @@ class RunningEstimate:
         region = ScanRegion(used.theta_rad)
         size_rad = min(float(np.exp(family.log_size)), self._expected_rad)
         worst_rad2, worst_id, unseen = -np.inf, table.facet_ids[0], []
+        seen: list[tuple[FacetFit, float]] = []
         for j, (facet_id, fit) in enumerate(zip(table.facet_ids, fits, strict=True)):
             verdict = None
             if fit is not None:
                 verdict = judge_fit(fit, used, j, factors[j] * centre_covariance(fit), region, size_rad)
-            if verdict is None or verdict.flags & FacetFlag.NO_SIGNAL:
+            if fit is None or verdict is None or verdict.flags & FacetFlag.NO_SIGNAL:
                 unseen.append(facet_id)
                 continue
+            seen.append((fit, factors[j]))
             variance_rad2 = _larger_variance(verdict.centre_cov_rad2)
             if variance_rad2 > worst_rad2:
                 worst_rad2, worst_id = variance_rad2, facet_id
         worst_rad = float(np.sqrt(worst_rad2)) if worst_rad2 >= 0.0 else np.inf
-        return LiveEstimate(table.n_records, worst_rad, worst_id, tuple(unseen))
+        area = AreaOfPsf(math.nan, math.nan)
+        if seen:
+            area = area_now([fit for fit, _ in seen], np.array([factor for _, factor in seen]))
+        return LiveEstimate(
+            table.n_records, worst_rad, worst_id, tuple(unseen), area.a_sigma_rad2, area.uncertainty_rad2
+        )
 
     def _without_bad(self, table: ResponseTable) -> ResponseTable:
         used = table.select(~np.isin(table.record_index, list(self._bad_records)))

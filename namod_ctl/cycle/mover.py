@@ -9,7 +9,7 @@ their answers are lost: so all of them are told, in a hurry, before anybody is a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, wait
 from contextlib import ExitStack
 from functools import partial
@@ -21,6 +21,7 @@ from namod_ctl.core.motion import MoveOrder, MoveOutcome, MoveResult, StopSwitch
 from namod_ctl.core.motion_settings import MotionSettings
 from namod_ctl.cycle.bus_worker import BusWorker, broken_text
 from namod_ctl.cycle.leg_course import Course, HomeCourse, MoveCourse
+from namod_ctl.cycle.leg_watch import Heard, LegWatch, WatchedDrive
 
 LOOK_S = 0.05
 """So often at least the caller's thread looks at the stop switch."""
@@ -42,6 +43,9 @@ class Mover:
     switch
         Thrown by people, by the cycle, and by the mover itself when anything goes wrong in its caller. Once thrown,
         this mover moves nothing any more.
+    show
+        Given what the drives said last, by leg, at most twice a second and at the end of whatever is asked of them;
+        called in the caller's thread. It must not raise: nobody stops a telescope for a display.
 
     Raises
     ------
@@ -50,12 +54,20 @@ class Mover:
     """
 
     def __init__(
-        self, buses: Sequence[Bus], clock: MonotonicClock, settings: MotionSettings, switch: StopSwitch
+        self,
+        buses: Sequence[Bus],
+        clock: MonotonicClock,
+        settings: MotionSettings,
+        switch: StopSwitch,
+        show: Callable[[Mapping[Leg, Heard]], None] = lambda heard: None,
     ) -> None:
         self._buses = tuple(buses)
         self._clock, self._settings, self._switch = clock, settings, switch
         self._bus_of = {leg: bus for bus in self._buses for leg in bus.drives}
-        self._drives = {leg: drive for bus in self._buses for leg, drive in bus.drives.items()}
+        self._watch = LegWatch(show)
+        self._drives: dict[Leg, Drive] = {
+            leg: WatchedDrive(leg, drive, self._watch) for bus in self._buses for leg, drive in bus.drives.items()
+        }
         if len(self._drives) != sum(len(bus.drives) for bus in self._buses):
             raise ValueError("a leg has two drives")
 
@@ -164,6 +176,7 @@ class Mover:
             interrupt = self._halt(workers, everybody=True)
             futures = [worker.submit(worker.standings) for worker in workers]
             found = {leg: words for future in futures for leg, words in future.result().items()}
+        self._watch.show(now=True)
         if interrupt is not None:
             raise interrupt
         return found
@@ -184,6 +197,7 @@ class Mover:
 
         def look() -> None:
             tell_finished()
+            self._watch.show()
             while_waiting()
 
         with ExitStack() as stack:
@@ -200,9 +214,11 @@ class Mover:
                 self._halt(workers)
                 try:
                     tell_finished()
+                    self._watch.show(now=True)
                 finally:
                     raise error  # the first one counts: a journal that fails cannot keep the rest either
             tell_finished()
+            self._watch.show(now=True)
             if interrupt is not None:
                 raise interrupt
 
@@ -210,7 +226,8 @@ class Mover:
         workers = []
         for bus in self._buses:
             own = [course for course in courses if course.leg in bus.drives]
-            worker = BusWorker(bus, own, self._clock, self._switch, broken_facets)
+            drives = {leg: self._drives[leg] for leg in bus.drives}
+            worker = BusWorker(bus, drives, own, self._clock, self._switch, broken_facets)
             stack.callback(worker.close)
             workers.append(worker)
         return workers
@@ -304,10 +321,11 @@ class Mover:
             futures = [worker.submit(partial(ask_bus, worker)) for worker in workers]
             try:
                 while not _all_done(futures, LOOK_S):
-                    pass
+                    self._watch.show()
             finally:
                 is_over = True
             found = {leg: answer for future in futures for leg, answer in future.result().items()}
+        self._watch.show()
         return {leg: found[leg] for leg in legs}
 
 

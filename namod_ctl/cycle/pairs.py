@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from namod_ctl.core.clock import Clock
 from namod_ctl.core.errors import CommunicationError, DeviceFaultError
 from namod_ctl.core.interfaces import Camera, Exposure, MonotonicClock
+from namod_ctl.cycle.frame_integrity import FrameFault, FrameGuard
 from namod_ctl.imaging.exposure import (
     ExposureRule,
     ExposureVerdict,
@@ -31,16 +32,12 @@ from namod_ctl.imaging.exposure import (
     judge_exposure,
     next_exposure_s,
 )
-from namod_ctl.imaging.radiometry import Frame
 from namod_ctl.optics.camera_model import CameraModel
 
 PAIRS_AHEAD = 3
 """Pairs that are kept or being made at a time: one to take, one to wait, one to expose; 7.3 MB each at FACT."""
 
 LOST_CAMERA_RETRY_S = 1.0
-
-TORN_ROWS = 4
-"""A camera that shows noise in every row but so many at the end has lost them on the way."""
 
 
 class DropCause(StrEnum):
@@ -52,6 +49,7 @@ class DropCause(StrEnum):
     REFLECTOR_STARVED = "reflector frame too dark"
     NO_FRAME = "frame lost or torn"
     STALE_FRAME = "the same frame twice"
+    LATE_FRAME = "frame of an earlier exposure"
     CAMERA_LOST = "camera lost"
 
 
@@ -60,6 +58,12 @@ _VERDICT_CAUSE = {
     ("star", ExposureVerdict.STARVED): DropCause.STAR_STARVED,
     ("reflector", ExposureVerdict.SATURATED): DropCause.REFLECTOR_SATURATED,
     ("reflector", ExposureVerdict.STARVED): DropCause.REFLECTOR_STARVED,
+}
+
+_FAULT_CAUSE = {
+    FrameFault.INCOMPLETE: DropCause.NO_FRAME,
+    FrameFault.REPEATED: DropCause.STALE_FRAME,
+    FrameFault.LATE: DropCause.LATE_FRAME,
 }
 
 
@@ -128,6 +132,11 @@ class CameraLine:
         "star" or "reflector".
     region
         Where light matters in its frames, see `imaging.exposure.frame_statistics`.
+
+    Attributes
+    ----------
+    guard
+        Looks for frames that are none; None for stored frames, which were looked at when they were taken.
     """
 
     def __init__(
@@ -142,15 +151,20 @@ class CameraLine:
         self.role = role
         self.camera = camera
         self.exposure_s = rule.clipped(first_exposure_s)
-        self.n_frames_missed = 0
+        self.guard: FrameGuard | None = FrameGuard()
         self._model, self._rule, self._limited, self._region = model, rule, rule, region
-        self._last_frame_id: int | None = None
+        self._begun_s = -math.inf
 
     def limit(self, longest_s: float) -> None:
         """From now on expose no longer than `longest_s`, nor longer than the rule says."""
         longest_s = min(max(longest_s, self._rule.shortest_s), self._rule.longest_s)
         self._limited = replace(self._rule, longest_s=longest_s)
         self.exposure_s = self._limited.clipped(self.exposure_s)
+
+    def begin(self, now_s: float) -> None:
+        """Begin an exposure of `exposure_s`; `now_s` is on the cameras' clock. Raises DeviceFaultError."""
+        self._begun_s = now_s
+        self.camera.start(self.exposure_s)
 
     def finish(self, timeout_s: float) -> tuple[Exposure | None, DropCause | None, str]:
         """The exposure begun last, why it is to be dropped (None if it is good), and that in words.
@@ -163,14 +177,9 @@ class CameraLine:
             return None, DropCause.NO_FRAME, str(error)
         except DeviceFaultError as error:
             return None, DropCause.CAMERA_LOST, str(error)
-        if exposure.frame_id == self._last_frame_id:
-            detail = f"{self.camera.name}: frame {exposure.frame_id} came twice"
-            return None, DropCause.STALE_FRAME, detail
-        if self._last_frame_id is not None:
-            self.n_frames_missed += max(0, exposure.frame_id - self._last_frame_id - 1)
-        self._last_frame_id = exposure.frame_id
-        if _is_torn(exposure.image):
-            return None, DropCause.NO_FRAME, f"{self.camera.name}: frame {exposure.frame_id} arrived incomplete"
+        fault = None if self.guard is None else self.guard.fault(exposure, self._begun_s)
+        if fault is not None:
+            return None, _FAULT_CAUSE[fault[0]], f"{self.camera.name}: {fault[1]}"
         statistics = frame_statistics(exposure.image, self._model, self._region)
         verdict = judge_exposure(statistics, exposure.exposure_s, self._limited)
         self.exposure_s = next_exposure_s(statistics, exposure.exposure_s, self._limited)
@@ -185,6 +194,7 @@ class PairSource:
     ----------
     max_retakes
         So often a pair is taken again for its exposure; then it is delivered as it is, for the measurement to judge.
+        0: stored frames, none of which may be left out.
     timeout_s
         How long after its exposure a frame is waited for.
     pace_s
@@ -211,6 +221,8 @@ class PairSource:
     ) -> None:
         self.end_s = math.inf
         self._star, self._reflector = star, reflector
+        if max_retakes == 0:
+            star.guard = reflector.guard = None
         self._clock, self._wall_clock = clock, wall_clock
         self._max_retakes, self._timeout_s, self._pace_s = max_retakes, timeout_s, pace_s
         self._look_after_s, self._star_seen_s = look_after_s, -math.inf
@@ -324,7 +336,7 @@ class PairSource:
             return None
         for _ in range(self._max_retakes + 1):
             try:
-                self._star.camera.start(self._star.exposure_s)
+                self._star.begin(self._clock.monotonic_s())
             except DeviceFaultError:
                 return None  # the next pair says so
             look, cause, _ = self._star.finish(self._timeout_s)
@@ -340,7 +352,7 @@ class PairSource:
             if line is second and lead_s > 0.0:
                 self._clock.wait_s(lead_s)
             try:
-                line.camera.start(line.exposure_s)
+                line.begin(self._clock.monotonic_s())
             except DeviceFaultError as error:
                 self._note(taking, (DropCause.CAMERA_LOST,), str(error))
                 if line is second:
@@ -353,15 +365,6 @@ class PairSource:
             return
         with self._lock:
             taking.dropped.update(causes)
-            taking.n_frames_missed = self._star.n_frames_missed + self._reflector.n_frames_missed
+            guards = [line.guard for line in (self._star, self._reflector) if line.guard is not None]
+            taking.n_frames_missed = sum(guard.n_missed for guard in guards)
             self._trouble = trouble
-
-
-def _is_torn(image: Frame) -> bool:
-    """True when the lower part of a frame never arrived: nothing but zeros, below rows that all show noise."""
-    if image[-1].any():
-        return False
-    has_light: NDArray[np.bool_] = np.asarray(image.reshape(len(image), -1).any(axis=1))
-    n_arrived = len(image) - int(np.argmax(has_light[::-1])) if has_light.any() else 0
-    n_missing = len(image) - n_arrived
-    return n_missing >= TORN_ROWS and bool(has_light[:n_arrived].all())

@@ -41,6 +41,7 @@ _REMEDY_OF_DROP = {
     DropCause.REFLECTOR_STARVED: "choose a brighter star, or open the reflector camera's aperture",
     DropCause.NO_FRAME: "check the camera's cable and that no other program loads the network or the USB",
     DropCause.STALE_FRAME: "take the camera's plug out and in again",
+    DropCause.LATE_FRAME: "check that no other program loads the network or the USB, and that none triggers the camera",
     DropCause.CAMERA_LOST: "check the camera's cable and power: the recording goes on when it is back",
 }
 

@@ -9,34 +9,26 @@ from __future__ import annotations
 import json
 import math
 import threading
-from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from namod_ctl.core.clock import Clock
-from namod_ctl.core.errors import ConfigError, StoreError
+from namod_ctl.core.errors import ConfigError, NamodError, StoreError
 from namod_ctl.core.interfaces import Camera, MonotonicClock
 from namod_ctl.core.records import Record
 from namod_ctl.core.units import deg_to_rad
 from namod_ctl.cycle.disk_trouble import is_mended_by_waiting
 from namod_ctl.cycle.live_estimate import LiveEstimator
-from namod_ctl.cycle.motion import (
-    MAX_SPEED_BASE_S,
-    judge_motion,
-    speed_from_before,
-    speed_from_look,
-    with_stored_verdict,
-)
+from namod_ctl.cycle.live_status import LiveNote, LivePictures, LiveStatus
+from namod_ctl.cycle.measure_pairs import PairMeasurer
+from namod_ctl.cycle.motion import MAX_SPEED_BASE_S
 from namod_ctl.cycle.pairs import CameraLine, Pair, PairSource, SourceExhaustedError, TimeIsUpError
 from namod_ctl.cycle.progress import Progress, Tracker
-from namod_ctl.cycle.wall_clock import WallClockWatch
 from namod_ctl.imaging.exposure import exposure_rule
-from namod_ctl.imaging.facets import FacetPhotometer
-from namod_ctl.imaging.measure import measure_record
 from namod_ctl.optics.camera_model import CameraModel
 from namod_ctl.optics.instrument import Instrument
 from namod_ctl.store.run import RunStore
@@ -54,11 +46,8 @@ MIN_COVERAGE_FOR_UNSEEN = 0.95
 """A facet that was not seen holds the rule of uncertainty up until the star has been nearly everywhere: then it does
 not throw its light into the region, and going on will not show it."""
 
-N_SPEEDS = 5
-"""The telescope's speed is the median of so many: one jump, or one wrong star, does not count."""
-
-MOTION_MARGIN = 0.8
-"""Of the longest exposure that the telescope's motion allows: it may quicken a little."""
+MAX_FACTOR = 3
+"""So many times the records that were wanted, at most, until the region is covered."""
 
 SESSION_GAP_S = 60.0
 """Between two sessions of a run, in its own time: more than lies between two records."""
@@ -118,7 +107,8 @@ class StopRule:
     uncertainty_rad
         Of the facet that is known worst. Facets that were not seen hold it up until the region is covered.
     min_coverage
-        Share of the region below which twice `n_records` are taken: a recording with gaps misses facets.
+        Share of the region below which, as with a hole in it, up to `MAX_FACTOR` times `n_records` are taken: a recording
+        with gaps misses facets.
     """
 
     n_records: int | None = None
@@ -129,8 +119,9 @@ class StopRule:
     def reason_to_stop(self, progress: Progress) -> str:
         """Why the recording is complete, for a person; empty while it is not."""
         estimate = progress.estimate
-        is_covered = progress.coverage.share >= self.min_coverage
-        if self.n_records is not None and progress.n_accepted >= self.n_records * (1 if is_covered else 2):
+        coverage = progress.coverage
+        is_covered = not self.min_coverage or (coverage.share >= self.min_coverage and not coverage.has_hole)
+        if self.n_records is not None and progress.n_accepted >= self.n_records * (1 if is_covered else MAX_FACTOR):
             return "all records wanted are there"
         if self.uncertainty_rad is None or estimate is None or estimate.n_records < MIN_RECORDS_FOR_UNCERTAINTY:
             return ""
@@ -189,24 +180,22 @@ class Recorder:
     ) -> None:
         self._equipment, self._instrument, self._store = equipment, instrument, store
         self._settings, self._estimator, self._replayed = settings, estimator, replayed
-        camera = instrument.reflector_camera
-        self._photometer = FacetPhotometer(
-            instrument.facet_polygons_px, store.facet_ids, camera.n_columns, camera.n_rows
-        )
         earlier = store.records()
-        self._next_index = earlier[-1].index + 1 if earlier else 0
-        self._before = next((record for record in reversed(earlier) if np.isfinite(record.theta_rad).all()), None)
         now_s = equipment.clock.monotonic_s()
         times_s = [record.star_mid_exposure_s for record in earlier if np.isfinite(record.star_mid_exposure_s)]
         # A run's time begins with its first session and only ever grows; a replay has it already.
-        self._offset_s = (max(times_s) + SESSION_GAP_S if times_s else 0.0) - now_s if replayed is None else 0.0
+        offset_s = (max(times_s) + SESSION_GAP_S if times_s else 0.0) - now_s if replayed is None else 0.0
+        self._measurer = PairMeasurer(
+            instrument, store.facet_ids, earlier, settings.max_motion_share, offset_s, replayed
+        )
         pace_s = settings.pace_s if replayed is None else 0.0
         self._tracker = Tracker(settings.region_radius_rad, now_s, settings.star_zero_point_mag, pace_s)
         for record in earlier:
             self._tracker.add_earlier(record)
+        self._exposure_limits_s: dict[str, tuple[float, float]] = {}
         self._source = PairSource(
             self._line("star", equipment.star_camera, instrument.star_camera),
-            self._line("reflector", equipment.reflector_camera, camera, self._facet_region()),
+            self._line("reflector", equipment.reflector_camera, instrument.reflector_camera, self._facet_region()),
             equipment.clock,
             equipment.wall_clock,
             settings.max_retakes if replayed is None else 0,
@@ -214,10 +203,10 @@ class Recorder:
             pace_s,
             MAX_SPEED_BASE_S if replayed is None else None,
         )
-        self._speeds: deque[float] = deque(maxlen=N_SPEEDS)
         self._is_asked_to_stop = threading.Event()
-        self._wall_clock = WallClockWatch()
-        self.events: list[str] = []
+        self._live = LiveNote(store)
+        self._pictures = LivePictures(store.path, instrument.star_camera, instrument.reflector_camera)
+        self.events = self._measurer.events
         """What befell the recording besides rejected records, one sentence each."""
 
     def ask_to_stop(self) -> None:
@@ -235,9 +224,11 @@ class Recorder:
             The frames are not of the instrument's cameras.
         """
         self._tracker.n_wanted = stop.n_records
-        reason = stop.reason_to_stop(self.progress())
+        progress = self.progress()
+        reason = stop.reason_to_stop(progress)
         if reason:
             return reason
+        self._show(progress, "the first pair of frames", now=True)
         if stop.duration_s is not None:
             self._source.end_s = self._tracker.start_s + stop.duration_s
         try:
@@ -248,13 +239,16 @@ class Recorder:
                         break
                     pair = self._source.next(POLL_S, self._longest_exposure_s())
                     if pair is not None:
-                        record = self._measured(pair)
+                        record = self._measurer.record_of(pair)
                         if not self._store_patiently(record, pair, on_progress):
                             reason = "stopped by hand; the last record could not be stored"
                             break
                         self._tracker.add(record, self._end_s(pair), self._source.status)
+                        if not self._settings.keep_frames:  # those that are kept can be looked at
+                            self._pictures.show(record.index, pair)
                         self._wait_for_estimate(stop, on_progress)
                     progress = self.progress(pair=pair)
+                    self._show(progress)
                     on_progress(progress)
                     reason = stop.reason_to_stop(progress)
         except SourceExhaustedError:
@@ -262,7 +256,11 @@ class Recorder:
         except TimeIsUpError:
             reason = f"{(stop.duration_s or 0.0) / 60.0:.3g} minutes are over"
             on_progress(self.progress())
+        except NamodError as error:
+            self._show(self.progress(), ended=f"it broke off: {error}", now=True)
+            raise
         self._note_session(reason)
+        self._show(self.progress(), ended=reason, now=True)
         return reason
 
     def progress(self, trouble: str = "", pair: Pair | None = None) -> Progress:
@@ -285,7 +283,9 @@ class Recorder:
             return
         self._estimator.update(self._tracker.n_accepted)
         while not self._is_asked_to_stop.is_set() and not self._estimator.is_ready(POLL_S):
-            on_progress(self.progress())
+            progress = self.progress()
+            self._show(progress, "the estimate of how well the facets are known")
+            on_progress(progress)
 
     def _line(
         self, role: str, camera: Camera, model: CameraModel, region: NDArray[np.uint8] | None = None
@@ -295,6 +295,7 @@ class Recorder:
         rule = exposure_rule(
             model, max(settings.shortest_s, shortest_s), min(settings.longest_s, longest_s), settings.target_share
         )
+        self._exposure_limits_s[role] = (rule.shortest_s, rule.longest_s)
         return CameraLine(role, camera, model, rule, settings.first_exposure_s, region)
 
     def _facet_region(self) -> NDArray[np.uint8]:
@@ -304,46 +305,20 @@ class Recorder:
         cv2.fillPoly(region, [np.rint(polygon).astype(np.int32) for polygon in polygons], 255)
         return region
 
-    def _measured(self, pair: Pair) -> Record:
-        stored = None if self._replayed is None else next(self._replayed)
-        if stored is not None:
-            index, label = stored.index, stored.label
-        else:
-            index = self._next_index
-            label = f"{pair.done:%Y%m%dT%H%M%S}_{index:06d}"
-            self.events += filter(None, [self._wall_clock.step(pair.done)])
-        record = replace(
-            measure_record(
-                pair.star.image,
-                pair.reflector.image,
-                pair.star.exposure_s,
-                pair.reflector.exposure_s,
-                self._instrument,
-                self._photometer,
-                index,
-                label,
-            ),
-            star_mid_exposure_s=pair.star.mid_exposure_s + self._offset_s,
-            reflector_mid_exposure_s=pair.reflector.mid_exposure_s + self._offset_s,
-        )
-        if not np.isfinite(record.theta_rad).all():
-            return record
-        speed = speed_from_before(self._before, record)
-        self._before = record
-        if stored is not None and math.isnan(speed):
-            return with_stored_verdict(record, stored)
-        if math.isnan(speed):
-            speed = speed_from_look(pair, record, self._instrument)
-        self._speeds.append(speed)
-        return judge_motion(record, speed, self._settings.max_motion_share * self._instrument.star_size_rad)
-
     def _longest_exposure_s(self) -> float:
-        """What the telescope's motion allows: a longer exposure would only be rejected."""
-        known = [speed for speed in self._speeds if speed > 0.0]
-        if not known:
-            return math.inf
-        limit_rad = self._settings.max_motion_share * self._instrument.star_size_rad
-        return max(MOTION_MARGIN * limit_rad / float(np.median(known)), self._settings.first_exposure_s)
+        """What the telescope's motion allows, but not less than a recording begins with."""
+        return max(self._measurer.longest_exposure_s(), self._settings.first_exposure_s)
+
+    def _show(self, progress: Progress, waits_for: str = "", *, ended: str = "", now: bool = False) -> None:
+        """Leave in the run, for other programs, how it goes."""
+        self._live.tell(lambda: self._status(progress, waits_for, ended), now=now)
+
+    def _status(self, progress: Progress, waits_for: str = "", ended: str = "") -> LiveStatus:
+        if not ended and not waits_for:
+            waits_for = "a pair of frames that can be used" if progress.source.trouble else "the next pair of frames"
+            if self._settings.pace_s and self._replayed is None:
+                waits_for += f", one every {self._settings.pace_s:.3g} s"
+        return LiveStatus.of(progress, self._exposure_limits_s, self._longest_exposure_s(), waits_for, ended)
 
     def _store_patiently(self, record: Record, pair: Pair, on_progress: Callable[[Progress], None]) -> bool:
         """Put the record on the disk; wait for a full one. False when somebody asks to stop meanwhile."""
@@ -358,11 +333,13 @@ class Recorder:
                     self.events.append(f"record {record.index} had to wait for the disk: {error}")
                 is_waiting = True
                 wait = f"NOTHING IS RECORDED; trying again every {self._settings.store_retry_s:g} s"
-                on_progress(self.progress(f"{error}; {wait}"))
+                progress = self.progress(f"{error}; {wait}")
+                self._show(progress, "the disk", now=True)
+                on_progress(progress)
                 if self._is_asked_to_stop.wait(self._settings.store_retry_s):
                     return False
             else:
-                self._next_index = record.index + 1
+                self._measurer.next_index = record.index + 1
                 return True
 
     def _put(self, record: Record, pair: Pair) -> None:
@@ -374,7 +351,7 @@ class Recorder:
                         "record with --keep-frames none"
                     )
                 self._store.add_frame(record.index, camera, exposure.image.astype(np.uint8, copy=False))
-        self._store.append([record])
+        self._store.append([record], self._live.with_record(lambda: self._status(self.progress(pair=pair))))
 
     def _note_session(self, reason: str) -> None:
         """Leave what the records do not say with the run."""

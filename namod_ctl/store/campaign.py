@@ -12,7 +12,6 @@ One process at a time works on a campaign (`campaign_lock`); any number may read
 from __future__ import annotations
 
 import json
-import math
 import sqlite3
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -21,15 +20,28 @@ from typing import Self
 
 from namod_ctl import __version__
 from namod_ctl.core.clock import Clock, SystemClock
-from namod_ctl.core.drives import Leg
+from namod_ctl.core.drives import DriveState, Leg
 from namod_ctl.core.errors import ConfigError, StoreError
-from namod_ctl.core.motion import MoveOrder, MoveOutcome, MoveResult
+from namod_ctl.core.motion import MoveOrder, MoveResult
 from namod_ctl.store.campaign_database import CAMPAIGN_DATABASE_NAME, connect_campaign, require_campaign
 from namod_ctl.store.campaign_folder import check_campaign_output, put_campaign_in_place, write_empty_campaign
 from namod_ctl.store.campaign_lock import CampaignLock
-from namod_ctl.store.campaign_rows import TRANSITION, AskedTurns, Cycle, Event, JournaledOrder, Json
-from namod_ctl.store.database import store_errors, transaction
+from namod_ctl.store.campaign_rows import (
+    TRANSITION,
+    AskedTurns,
+    Cycle,
+    Event,
+    JournaledOrder,
+    Json,
+    event_of,
+    order_of,
+    real,
+    target_of,
+    without_nan,
+)
+from namod_ctl.store.database import store_errors, transaction, unsynced
 from namod_ctl.store.folders import discard, free_sibling
+from namod_ctl.store.live_legs import SeenLeg, read_legs, save_legs
 
 _NOTE = "note."
 _CYCLE_COLUMNS = (
@@ -157,7 +169,7 @@ class CampaignStore:
 
     def add_event(self, kind: str, text: str, data: Mapping[str, Json] | None = None) -> int:
         """Journal something that happened; its id. NaN and infinite numbers in `data` become None."""
-        data_json = json.dumps(_without_nan(dict(data or {})), allow_nan=False)
+        data_json = json.dumps(without_nan(dict(data or {})), allow_nan=False)
         with store_errors(self._database):
             cursor = self._connection.execute(
                 "INSERT INTO events (time_utc, kind, text, data_json) VALUES (?, ?, ?, ?)",
@@ -177,7 +189,7 @@ class CampaignStore:
                 "SELECT event_id, time_utc, kind, text, data_json FROM events WHERE event_id > ? ORDER BY event_id",
                 (since_id,),
             ).fetchall()
-        return [self._event(row) for row in rows]
+        return [event_of(row) for row in rows]
 
     def last_state(self) -> str | None:
         """State that the last transition led to; None before the first."""
@@ -192,7 +204,7 @@ class CampaignStore:
                 "ORDER BY event_id DESC LIMIT 1",
                 (TRANSITION,),
             ).fetchone()
-        return None if row is None else self._event(row)
+        return None if row is None else event_of(row)
 
     def begin_cycle(self) -> int:
         """Number of a new cycle; its run goes to the folder `cycle_NN` inside the campaign's (`run_path`)."""
@@ -239,10 +251,10 @@ class CampaignStore:
                 int(number),
                 str(folder),
                 int(n_records),
-                _number(now),
-                _number(uncertainty),
-                _number(predicted),
-                _number(limit),
+                real(now),
+                real(uncertainty),
+                real(predicted),
+                real(limit),
                 alignment_json,
                 str(decision),
             )
@@ -257,7 +269,14 @@ class CampaignStore:
                 cursor = self._connection.execute(
                     "INSERT INTO orders (time_utc, cycle, facet_id, leg_index, start_m, target_m) "
                     "VALUES (?, ?, ?, ?, ?, ?)",
-                    (self._now(), cycle, order.leg.facet_id, order.leg.index, float(order.start_m), _finite(order)),
+                    (
+                        self._now(),
+                        cycle,
+                        order.leg.facet_id,
+                        order.leg.index,
+                        float(order.start_m),
+                        target_of(order),
+                    ),
                 )
                 ids.append(int(cursor.lastrowid or 0))
         return ids
@@ -287,6 +306,16 @@ class CampaignStore:
     def unfinished_orders(self) -> list[JournaledOrder]:
         """Orders without a result: where their legs are is unknown until somebody reads the drives back."""
         return self._read_orders("WHERE outcome IS NULL")
+
+    def show_legs(self, heard: Mapping[Leg, DriveState | str]) -> None:
+        """Leave what drives said last, or why they did not, for whoever looks; without waiting for the disk."""
+        with store_errors(self._database), unsynced(self._connection), transaction(self._connection):
+            save_legs(self._connection, heard, self._now())
+
+    def seen_legs(self) -> dict[Leg, SeenLeg]:
+        """What was known last of every leg whose drive was ever read, in their order."""
+        with store_errors(self._database):
+            return read_legs(self._connection)
 
     def ask_turns(self, cycle: int, turns_deg: Mapping[int, Sequence[float]]) -> None:
         """Write which turns a person is asked for in a cycle, per facet id one per bolt, in place of older ones."""
@@ -351,44 +380,7 @@ class CampaignStore:
                 f"FROM orders LEFT JOIN results USING (order_id) {condition} ORDER BY order_id",
                 values,
             ).fetchall()
-        return [self._journaled_order(row) for row in rows]
-
-    def _journaled_order(self, row: Sequence[object]) -> JournaledOrder:
-        order_id, cycle, facet_id, leg_index, start_m, target_m, outcome, readback_m, detail = row
-        order = MoveOrder(Leg(int(str(facet_id)), int(str(leg_index))), _number(start_m), _number(target_m))
-        result = None
-        if outcome is not None:
-            try:
-                result = MoveResult(order, MoveOutcome(str(outcome)), _number(readback_m), str(detail))
-            except ValueError:
-                raise StoreError(
-                    f"{self._database}: order {order_id} has the unknown outcome {outcome!r}; update namod-ctl"
-                ) from None
-        return JournaledOrder(int(str(order_id)), int(str(cycle)), order, result)
-
-    def _event(self, row: Sequence[object]) -> Event:
-        event_id, time_utc, kind, text, data_json = row
-        return Event(int(str(event_id)), str(time_utc), str(kind), str(text), json.loads(str(data_json)))
+        return [order_of(row, self._database) for row in rows]
 
     def _now(self) -> str:
         return self._clock.now().isoformat()
-
-
-def _number(value: object) -> float:
-    return math.nan if value is None else float(str(value))
-
-
-def _finite(order: MoveOrder) -> float:
-    if not math.isfinite(order.target_m):
-        raise ValueError(f"{order.leg}: {order.target_m} m is no target")
-    return float(order.target_m)
-
-
-def _without_nan(value: Json) -> Json:
-    if isinstance(value, float):
-        return float(value) if math.isfinite(value) else None  # numpy's float64 is a float
-    if isinstance(value, Mapping):
-        return {str(key): _without_nan(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_without_nan(each) for each in value]
-    return value

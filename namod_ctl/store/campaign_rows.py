@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TypeAlias
 
-from namod_ctl.core.motion import MoveOrder, MoveResult
+from namod_ctl.core.drives import Leg
+from namod_ctl.core.errors import StoreError
+from namod_ctl.core.motion import MoveOrder, MoveOutcome, MoveResult
 
 Json: TypeAlias = "bool | int | float | str | Sequence[Json] | Mapping[str, Json] | None"
 
@@ -95,3 +99,50 @@ class AskedTurns:
     facet_id: int
     turns_deg: tuple[float, ...]
     is_done: bool
+
+
+def real(value: object) -> float:
+    """A number in a row; NULL is NaN."""
+    return math.nan if value is None else float(str(value))
+
+
+def event_of(row: Sequence[object]) -> Event:
+    """The event in a row of its id, time, kind, text and data."""
+    event_id, time_utc, kind, text, data_json = row
+    return Event(int(str(event_id)), str(time_utc), str(kind), str(text), json.loads(str(data_json)))
+
+
+def order_of(row: Sequence[object], database: Path) -> JournaledOrder:
+    """The order in a row of its id, cycle, facet, leg, start, target, and its result's outcome, readback and detail.
+
+    Raises StoreError for an unknown outcome.
+    """
+    order_id, cycle, facet_id, leg_index, start_m, target_m, outcome, readback_m, detail = row
+    order = MoveOrder(Leg(int(str(facet_id)), int(str(leg_index))), real(start_m), real(target_m))
+    result = None
+    if outcome is not None:
+        try:
+            result = MoveResult(order, MoveOutcome(str(outcome)), real(readback_m), str(detail))
+        except ValueError:
+            raise StoreError(
+                f"{database}: order {order_id} has the unknown outcome {outcome!r}; update namod-ctl"
+            ) from None
+    return JournaledOrder(int(str(order_id)), int(str(cycle)), order, result)
+
+
+def target_of(order: MoveOrder) -> float:
+    """The order's target. Raises ValueError when it is none."""
+    if not math.isfinite(order.target_m):
+        raise ValueError(f"{order.leg}: {order.target_m} m is no target")
+    return float(order.target_m)
+
+
+def without_nan(value: Json) -> Json:
+    """The same, with None for NaN and infinite numbers."""
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None  # numpy's float64 is a float
+    if isinstance(value, Mapping):
+        return {str(key): without_nan(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [without_nan(each) for each in value]
+    return value

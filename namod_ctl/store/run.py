@@ -14,7 +14,8 @@ import json
 import os
 import re
 import sqlite3
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -25,15 +26,15 @@ from numpy.typing import NDArray
 from namod_ctl import __version__
 from namod_ctl.core.clock import Clock
 from namod_ctl.core.errors import StoreError
-from namod_ctl.core.flags import RejectReason
 from namod_ctl.core.records import Record
-from namod_ctl.store.database import DATABASE_NAME, connect_existing, connect_new, store_errors, transaction
+from namod_ctl.store.database import DATABASE_NAME, connect_existing, connect_new, store_errors, transaction, unsynced
 from namod_ctl.store.folders import check_output, discard, free_sibling, put_in_place, require_run
 from namod_ctl.store.frames import Frame, decode_png, encode_png, read_verified, sync_folder, write_file_durably
+from namod_ctl.store.run_rows import INSERT_RECORD, record_columns, record_of, record_row
 
 FRAMES_FOLDER = "frames"
 _ROWS_PER_READ = 65536
-_NOTE = "note."  # keys of notes in the table meta, apart from the run's own
+NOTE_PREFIX = "note."  # of keys of notes in the table meta, apart from the run's own
 _CAMERA_NAME = re.compile(r"[a-z0-9_]+")
 
 
@@ -189,17 +190,21 @@ class RunStore:
 
     def note(self, key: str) -> str | None:
         """What an importer or recorder noted under `key` about this run, None when it did not."""
-        return self._meta.get(_NOTE + key)
+        return self._meta.get(NOTE_PREFIX + key)
 
-    def set_note(self, key: str, text: str) -> None:
-        """Note something about this run, in place of what stood under `key`."""
+    def set_note(self, key: str, text: str, *, is_passing: bool = False) -> None:
+        """Note something about this run, in place of what stood under `key`.
+
+        What `is_passing` is not waited for until it is on the disk: other programs see it at once, and it may be gone
+        after a power cut.
+        """
         self.check_in_place()
-        with store_errors(self._database):
-            self._connection.execute("INSERT OR REPLACE INTO meta VALUES (?, ?)", (_NOTE + key, text))
-        self._meta[_NOTE + key] = text
+        with store_errors(self._database), unsynced(self._connection) if is_passing else nullcontext():
+            rows = self._write_notes({key: text})
+        self._meta |= rows
 
-    def append(self, records: Iterable[Record]) -> None:
-        """Add records, all of them or none: when this returns they are on the disk.
+    def append(self, records: Iterable[Record], notes: Mapping[str, str] | None = None) -> None:
+        """Add records and set notes, all of them or nothing: when this returns they are on the disk.
 
         Raises StoreError for an index that the run already has, and when the run is not where it was opened.
         """
@@ -210,28 +215,24 @@ class RunStore:
                 raise ValueError(f"record {record.index}: its arrays do not fit the run's {n_facets} facets")
         self.check_in_place()
         with store_errors(self._database), transaction(self._connection):
-            self._connection.executemany(
-                "INSERT INTO records VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", map(_record_row, records)
-            )
+            self._connection.executemany(INSERT_RECORD, map(record_row, records))
             self._connection.executemany(
                 "INSERT INTO responses VALUES (?, ?, ?, ?)",
                 (row for record in records for row in self._response_rows(record)),
             )
+            rows = self._write_notes(notes or {})
+        self._meta |= rows
 
     def records(self) -> list[Record]:
         """All records, ascending by index."""
         with store_errors(self._database), transaction(self._connection, reads_only=True):
-            columns = {str(row[1]) for row in self._connection.execute("PRAGMA table_info(records)")}
-            # a run of schema version 1, opened to read only, has no times
-            times = "star_mid_exposure_s, reflector_mid_exposure_s"
-            times = times if "star_mid_exposure_s" in columns else "NULL, NULL"
-            rows = self._connection.execute(
-                "SELECT record_index, label, theta_x_rad, theta_y_rad, theta_uncertainty_rad, star_intensity, "
-                f"star_exposure_s, reflector_exposure_s, {times}, reject_reason, detail FROM records "
-                "ORDER BY record_index"
-            ).fetchall()
+            columns = record_columns(str(row[1]) for row in self._connection.execute("PRAGMA table_info(records)"))
+            rows = self._connection.execute(f"SELECT {columns} FROM records ORDER BY record_index").fetchall()
             responses = self._read_responses(len(rows))
-        return [self._record(row, of_facets) for row, of_facets in zip(rows, responses, strict=True)]
+        return [
+            record_of(row, intensity.copy(), share.copy(), self._database)
+            for row, (intensity, share) in zip(rows, responses, strict=True)
+        ]
 
     def labels(self) -> list[tuple[int, str]]:
         """Index and label of all records, ascending by index."""
@@ -297,6 +298,11 @@ class RunStore:
             ).fetchone()
         return None if row is None else str(row[0])
 
+    def _write_notes(self, notes: Mapping[str, str]) -> dict[str, str]:
+        rows = {NOTE_PREFIX + key: text for key, text in notes.items()}
+        self._connection.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", rows.items())
+        return rows
+
     def _check_meta(self) -> None:
         for key in ("config_json", "telescope", "source", "created_utc", "program_version"):
             if key not in self._meta:
@@ -326,32 +332,6 @@ class RunStore:
         rank_of_id = np.argsort(np.argsort(self._facet_ids))  # rows come sorted by id, the run has its own order
         return table.reshape(n_records, n_facets, 2)[:, rank_of_id, :].transpose(0, 2, 1)
 
-    def _record(self, row: Sequence[object], responses: NDArray[np.float64]) -> Record:
-        index, label, *numbers, reason, detail = row
-        values = np.array(numbers, dtype=np.float64)
-        theta_x, theta_y, uncertainty, star, star_exposure, reflector_exposure, star_mid, reflector_mid = values
-        try:
-            reject_reason = None if reason is None else RejectReason(str(reason))
-        except ValueError:
-            raise StoreError(
-                f"{self._database}: record {index} has the unknown reject reason {reason!r}; update namod-ctl"
-            ) from None
-        return Record(
-            index=int(str(index)),
-            label=str(label),
-            theta_rad=np.array([theta_x, theta_y]),
-            theta_uncertainty_rad=float(uncertainty),
-            star_intensity=float(star),
-            facet_intensity=responses[0].copy(),
-            facet_saturated_share=responses[1].copy(),
-            star_exposure_s=float(star_exposure),
-            reflector_exposure_s=float(reflector_exposure),
-            reject_reason=reject_reason,
-            detail=str(detail),
-            star_mid_exposure_s=float(star_mid),
-            reflector_mid_exposure_s=float(reflector_mid),
-        )
-
 
 def _telescope_name(config_json: str) -> str:
     telescope = json.loads(config_json).get("telescope", {})
@@ -370,20 +350,3 @@ def _write_empty_run(folder: Path, facet_ids: Sequence[int], meta: dict[str, str
         finally:
             connection.close()
         sync_folder(folder)
-
-
-def _record_row(record: Record) -> tuple[object, ...]:
-    return (
-        int(record.index),
-        record.label,
-        float(record.theta_rad[0]),
-        float(record.theta_rad[1]),
-        float(record.theta_uncertainty_rad),
-        float(record.star_intensity),
-        float(record.star_exposure_s),
-        float(record.reflector_exposure_s),
-        None if record.reject_reason is None else record.reject_reason.value,
-        record.detail,
-        float(record.star_mid_exposure_s),
-        float(record.reflector_mid_exposure_s),
-    )

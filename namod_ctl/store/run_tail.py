@@ -6,7 +6,6 @@ Cost of a look at a run that has not changed: one `PRAGMA data_version`, some mi
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -15,14 +14,16 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from namod_ctl.core.errors import StoreError
-from namod_ctl.core.flags import RejectReason
 from namod_ctl.core.records import Record
 from namod_ctl.store.database import DATABASE_NAME, connect_existing, store_errors, transaction
-from namod_ctl.store.frames import REFLECTOR_CAMERA, STAR_CAMERA
+from namod_ctl.store.live_pictures import CAMERAS, live_pictures
 from namod_ctl.store.pulse import Pulse
+from namod_ctl.store.run import NOTE_PREFIX
+from namod_ctl.store.run_rows import record_columns, record_of
 
 Array = NDArray[np.float64]
+
+_BEFORE_ALL = -(2**62)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,10 +76,10 @@ class RunTail:
         self._database = path / DATABASE_NAME
         self._connection = connect_existing(self._database, read_only=True)
         with store_errors(self._database):
-            columns = {str(row[1]) for row in self._connection.execute("PRAGMA table_info(records)")}
-        self._has_times = "star_mid_exposure_s" in columns  # schema version 1 has none
+            table = self._connection.execute("PRAGMA table_info(records)").fetchall()
+        self._columns = record_columns(str(row[1]) for row in table)
         self._pulse = Pulse(self._connection, self._database)
-        self._last_index = self._last_bright_index = -(2**62)
+        self._last_index = self._last_bright_index = _BEFORE_ALL
 
     def __enter__(self) -> Self:
         return self
@@ -99,17 +100,31 @@ class RunTail:
 
     def new_records(self) -> list[Record]:
         """Records committed since the last look, ascending; their arrays per facet are left empty."""
-        times = "star_mid_exposure_s, reflector_mid_exposure_s" if self._has_times else "NULL, NULL"
         with store_errors(self._database), transaction(self._connection, reads_only=True):
             rows = self._connection.execute(
-                "SELECT record_index, label, theta_x_rad, theta_y_rad, theta_uncertainty_rad, star_intensity, "
-                f"star_exposure_s, reflector_exposure_s, {times}, reject_reason, detail FROM records "
-                "WHERE record_index > ? ORDER BY record_index",
-                (self._last_index,),
+                f"SELECT {self._columns} FROM records WHERE record_index > ? ORDER BY record_index", (self._last_index,)
             ).fetchall()
         if rows:
             self._last_index = int(rows[-1][0])
-        return [self._record(row) for row in rows]
+        return [record_of(row, np.empty(0), np.empty(0), self._database) for row in rows]
+
+    def rewind(self) -> None:
+        """Have `new_records` begin with the first record again."""
+        self._last_index = _BEFORE_ALL
+
+    def note(self, key: str) -> str | None:
+        """What stands at this moment under `key` in the run's notes, None when nothing does."""
+        with store_errors(self._database):
+            row = self._connection.execute("SELECT value FROM meta WHERE key = ?", (NOTE_PREFIX + key,)).fetchone()
+        return None if row is None else str(row[0])
+
+    def theta_rad(self, record_index: int) -> Array:
+        """Where the star stood in that record, shape (2,); NaN where it was not seen, or there is no such record."""
+        with store_errors(self._database):
+            row = self._connection.execute(
+                "SELECT theta_x_rad, theta_y_rad FROM records WHERE record_index = ?", (record_index,)
+            ).fetchone()
+        return np.array(row or (None, None), dtype=np.float64)
 
     def new_brightest(self) -> dict[int, Brightest]:
         """Of every facet, by its id, in the records that count and were committed since this was asked last."""
@@ -131,17 +146,24 @@ class RunTail:
         }
 
     def latest_frames(self) -> dict[str, int]:
-        """Index of the last committed record of which a camera's frame was kept, by camera's name."""
+        """Index of the last committed record of which there is a picture to show, by camera's name.
+
+        A frame that was kept, or one that is only there to be looked at (`live_pictures`).
+        """
         found = {}
+        passing = live_pictures(self.path)
         with store_errors(self._database):
-            for camera in (STAR_CAMERA, REFLECTOR_CAMERA):
+            for camera in CAMERAS:
                 row = self._connection.execute(
                     "SELECT record_index FROM frames WHERE camera = ? "
                     "AND record_index <= (SELECT MAX(record_index) FROM records) ORDER BY record_index DESC LIMIT 1",
                     (camera,),
                 ).fetchone()
-                if row is not None:
-                    found[camera] = int(row[0])
+                indices = [int(row[0])] if row is not None else []
+                if camera in passing:
+                    indices.append(passing[camera])
+                if indices:
+                    found[camera] = max(indices)
         return found
 
     def latest_estimate_id(self) -> int:
@@ -161,29 +183,3 @@ class RunTail:
             ).fetchall()
         table = np.array(rows, dtype=np.float64).reshape(-1, 3)  # None becomes NaN
         return FacetSamples(table[:, :2], table[:, 2])
-
-    def _record(self, row: tuple[object, ...]) -> Record:
-        index, label, *numbers, reason, detail = row
-        theta_x, theta_y, *others = (math.nan if number is None else float(str(number)) for number in numbers)
-        uncertainty, star, star_exposure, reflector_exposure, star_mid, reflector_mid = others
-        try:
-            reject_reason = None if reason is None else RejectReason(str(reason))
-        except ValueError:
-            raise StoreError(
-                f"{self._database}: record {index} has the unknown reject reason {reason!r}; update namod-ctl"
-            ) from None
-        return Record(
-            index=int(str(index)),
-            label=str(label),
-            theta_rad=np.array([theta_x, theta_y]),
-            theta_uncertainty_rad=uncertainty,
-            star_intensity=star,
-            facet_intensity=np.empty(0),
-            facet_saturated_share=np.empty(0),
-            star_exposure_s=star_exposure,
-            reflector_exposure_s=reflector_exposure,
-            reject_reason=reject_reason,
-            detail=str(detail),
-            star_mid_exposure_s=star_mid,
-            reflector_mid_exposure_s=reflector_mid,
-        )

@@ -54,10 +54,40 @@ telescope = { radius_deg = 0.15, spacing_arcmin = 1.5 }
 """
 
 
+BY_HAND = CONFIG.split("[actuators]")[0]
+
+SIZES = {"phone": (390, 844), "laptop": (1366, 768), "wide": (2560, 1440)}
+
+OVERLAPS = """() => {
+  const boxes = [...document.querySelectorAll('section, header')]
+    .filter((e) => e.offsetParent !== null || e.tagName === 'HEADER')
+    .map((e) => [e.querySelector('h1, h2').id, e.getBoundingClientRect()]);
+  const found = [];
+  for (const [i, [a, p]] of boxes.entries()) for (const [b, q] of boxes.slice(i + 1)) {
+    const w = Math.min(p.right, q.right) - Math.max(p.left, q.left);
+    const h = Math.min(p.bottom, q.bottom) - Math.max(p.top, q.top);
+    if (w > 1 && h > 1) found.push(`${a} over ${b}`);
+  }
+  for (const e of document.querySelectorAll('section *')) {
+    if (e.closest('.scroll') || e.closest('svg') || e.matches('.unseen, .unseen *') || !e.offsetParent) continue;
+    const p = e.getBoundingClientRect(), q = e.closest('section').getBoundingClientRect();
+    if (p.width && (p.right > q.right + 1 || p.left < q.left - 1)) found.push(`${e.tagName} ${e.id} sticks out`);
+  }
+  return found;
+}"""
+
+NOT_RED = """() => [...document.querySelectorAll('body *')].flatMap((e) => {
+  const style = getComputedStyle(e);
+  return [style.color, style.backgroundColor, style.fill, style.stroke]
+    .map((c) => c.match(/[\\d.]+/g)?.map(Number) ?? [])
+    .filter(([r, g, b, a]) => a !== 0 && (g > 0.75 * r || b > 0.75 * r) && r + g + b > 0);
+})"""
+
+
 @contextmanager
-def aligning(folder: Path, *options: str) -> Iterator[Path]:
+def aligning(folder: Path, *options: str, config: str = CONFIG) -> Iterator[Path]:
     """A campaign that another process works on; ends with the block, if it has not ended before."""
-    (folder / "six.toml").write_text(CONFIG)
+    (folder / "six.toml").write_text(config)
     (folder / "twin.toml").write_text(TWIN)
     campaign = folder / "CAMPAIGN"
     arguments = ["align", "--config", str(folder / "six.toml"), "--twin-settings", str(folder / "twin.toml")]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import threading
 import time
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -11,32 +12,13 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 from dashboard_samples import EVIL, new_run, record
-from page_rig import TOKEN, Watcher, served, state_of, wait_until
+from page_rig import NOT_RED, OVERLAPS, SIZES, TOKEN, Watcher, served, state_of, wait_until
 from playwright.sync_api import Browser, Page, expect
 
 from namod_ctl.core.flags import RejectReason
+from namod_ctl.cycle.recording_control import RecordingControl
 
 axe = pytest.importorskip("axe_core_python.sync_playwright")
-
-SIZES = {"phone": (390, 844), "laptop": (1366, 768), "wide": (2560, 1440)}
-
-OVERLAPS = """() => {
-  const boxes = [...document.querySelectorAll('section, header')]
-    .filter((e) => e.offsetParent !== null || e.tagName === 'HEADER')
-    .map((e) => [e.querySelector('h1, h2').id, e.getBoundingClientRect()]);
-  const found = [];
-  for (const [i, [a, p]] of boxes.entries()) for (const [b, q] of boxes.slice(i + 1)) {
-    const w = Math.min(p.right, q.right) - Math.max(p.left, q.left);
-    const h = Math.min(p.bottom, q.bottom) - Math.max(p.top, q.top);
-    if (w > 1 && h > 1) found.push(`${a} over ${b}`);
-  }
-  for (const e of document.querySelectorAll('section *')) {
-    if (e.closest('.scroll') || e.closest('svg') || e.matches('.unseen, .unseen *') || !e.offsetParent) continue;
-    const p = e.getBoundingClientRect(), q = e.closest('section').getBoundingClientRect();
-    if (p.width && (p.right > q.right + 1 || p.left < q.left - 1)) found.push(`${e.tagName} ${e.id} sticks out`);
-  }
-  return found;
-}"""
 
 
 def opened(page: Page, address: str) -> Page:
@@ -97,14 +79,7 @@ def test_night_is_one_tap_remembered_and_never_white(browser: Browser, address: 
     opened(again, address)
     assert again.evaluate("() => window.first") == "night"
     assert again.evaluate(back) == "rgb(0, 0, 0)"
-    greens = again.evaluate(
-        """() => [...document.querySelectorAll('body *')].flatMap((e) => {
-          const style = getComputedStyle(e);
-          return [style.color, style.backgroundColor].map((c) => c.match(/[\\d.]+/g).map(Number))
-            .filter(([r, g, b, a]) => a !== 0 && (g > 0.75 * r || b > 0.75 * r) && r + g + b > 0);
-        })"""
-    )
-    assert greens == []  # red on black: nothing that blinds
+    assert again.evaluate(NOT_RED) == []  # red on black: nothing that blinds
     context.close()
 
 
@@ -180,6 +155,32 @@ def test_html_in_a_name_is_shown_as_it_is(page: Page, watcher: Watcher, tmp_path
         expect(page.locator("#title")).to_have_text(f"{EVIL}: R")
         assert page.locator("#title *").count() == 0
     assert watcher.complaints == []
+
+
+def test_plain_recording_is_ended_from_the_page_after_one_confirmation(page: Page, tmp_path: Path) -> None:
+    is_asked = threading.Event()
+    with new_run(tmp_path / "R") as run, served(tmp_path / "R") as address:
+        run.append([record(0, len(run.facet_ids))])
+        opened(page, f"{address}#token={TOKEN.replace(' ', '%20')}")
+        expect(page.locator("#stop")).to_have_attribute("aria-disabled", "true")  # nobody records
+        with RecordingControl(tmp_path / "R", is_asked.set) as control:
+            expect(page.locator("#stop")).to_have_attribute("aria-disabled", "false")
+            page.locator("#stop").click()
+            expect(page.locator("#stop-dialog")).to_contain_text("All its records are kept")
+            assert not is_asked.is_set()
+            recorder = threading.Thread(target=looking, args=(control, is_asked))
+            recorder.start()
+            page.get_by_role("button", name="Stop now").click()
+            expect(page.locator("#reply")).to_contain_text("stopping")
+            recorder.join(10.0)
+            assert is_asked.is_set()
+        expect(page.locator("#state")).to_have_text("at rest")  # at once: it is known that nobody records any more
+
+
+def looking(control: RecordingControl, is_asked: threading.Event) -> None:
+    """A recorder between its records, until it is asked to stop."""
+    while not is_asked.wait(0.01):
+        control.look()
 
 
 def test_commands_need_the_token_stop_needs_one_confirmation_and_the_end_can_be_viewed(

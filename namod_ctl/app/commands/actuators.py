@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import signal
-from collections.abc import Callable, Iterator, Sequence
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from types import FrameType
@@ -14,8 +16,8 @@ from rich.console import Console
 from rich.text import Text
 
 from namod_ctl.app.actuator_tables import (
+    identity_lines,
     legs_named,
-    short_name,
     table_of_drives,
     table_of_orders,
     table_of_results,
@@ -25,6 +27,7 @@ from namod_ctl.app.actuator_tables import (
 from namod_ctl.app.build_actuators import build_bus_settings, build_motion_settings, open_actuators
 from namod_ctl.app.build_twin_actuators import build_twin_actuators, twin_wiring
 from namod_ctl.app.config import InstrumentConfig, load_config
+from namod_ctl.app.number_ranges import counted, legs_in_words
 from namod_ctl.core.clock import SystemMonotonicClock
 from namod_ctl.core.drives import DriveState, Leg
 from namod_ctl.core.errors import CommunicationError, ConfigError
@@ -47,7 +50,12 @@ EXIT_INCOMPLETE = 1
 TEST_TRAVEL_MM = 0.1
 MAX_TEST_TRAVEL_MM = 2.0
 
-app = typer.Typer(add_completion=False, no_args_is_help=True, help="Look at the drives of the legs, move, stop, test.")
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    help="Look at the drives of the legs, move, stop, test.",
+)
 
 _Config = Annotated[str, typer.Option("--config", help="Instrument: a TOML file, or a built-in name.")]
 _IsTwin = Annotated[
@@ -65,6 +73,7 @@ class _Rig:
     mover: Mover
     settings: MotionSettings
     console: Console
+    bus_names: Mapping[Leg, str]
 
     def chosen(self, names: list[str] | None, *, is_all: bool) -> tuple[Leg, ...]:
         if bool(names) == is_all:
@@ -83,11 +92,13 @@ def list_drives(config: _Config = DEFAULT_CONFIG, twin: _IsTwin = False) -> None
         answering = [leg for leg, state in states.items() if not isinstance(state, str)]
         identities = rig.mover.identities(answering)
         names = {leg: rig.mover.drive_name(leg) for leg in states}
-        rig.console.print(table_of_drives(states, identities, names))
+        rig.console.print(table_of_drives(states, names, rig.bus_names))
+        for line in identity_lines(identities):
+            rig.console.print(line, soft_wrap=True)
         n_ready = sum(
             isinstance(state, DriveState) and state.is_homed and not state.faults for state in states.values()
         )
-        rig.console.print(f"{n_ready} of {len(states)} drives are ready to move")
+        rig.console.print(f"{n_ready} of {counted(len(states), 'drive')} ready to move")
     _leave(is_complete=n_ready == len(states))
 
 
@@ -107,7 +118,7 @@ def home(
         chosen = rig.chosen(legs, is_all=all_)
         states = rig.mover.read_states(chosen)
         rig.console.print(table_of_words("stands at", {leg: _standing(state) for leg, state in states.items()}))
-        _ask(f"{len(chosen)} legs go to their references, wherever those are. Go on?", is_yes=yes)
+        _ask(f"{counted(len(chosen), 'leg')} to be brought to the reference, wherever that is. Go on?", is_yes=yes)
         homed = rig.mover.home(chosen, lambda: None)
         rig.console.print(table_of_words("result", {leg: words or "homed" for leg, words in homed.items()}))
     _leave(is_complete=not any(homed.values()))
@@ -126,6 +137,7 @@ def move(
 
     Example: namod-ctl actuators move 13 --to-mm 0.5 --twin
     """
+    _refuse_no_number("--to-mm", to_mm)
     _carry_out(legs, lambda now_m: mm_to_m(to_mm), config, is_all=all_, is_twin=twin, is_yes=yes)
 
 
@@ -142,6 +154,7 @@ def jog(
 
     Example: namod-ctl actuators jog 13.2 --by-mm -0.05 --twin
     """
+    _refuse_no_number("--by-mm", by_mm)
     _carry_out(legs, lambda now_m: now_m + mm_to_m(by_mm), config, is_all=all_, is_twin=twin, is_yes=yes)
 
 
@@ -183,15 +196,21 @@ def selftest(
     """
     with _rig(config, is_twin=twin) as rig:
         chosen = rig.chosen(legs, is_all=all_)
-        _ask(f"{len(chosen)} legs go {travel_mm:g} mm up and back, one after the other. Go on?", is_yes=yes)
+        _ask(
+            f"{counted(len(chosen), 'leg')} to go {travel_mm:g} mm up and back, one after the other. Go on?", is_yes=yes
+        )
         tests = []
         with rig.console.status("") as status:
             for test in self_test(rig.mover, chosen, mm_to_m(travel_mm), rig.settings, lambda: None):
                 tests.append(test)
-                status.update(f"{len(tests)} of {len(chosen)} legs tested")
+                status.update(f"{len(tests)} of {counted(len(chosen), 'leg')} tested")
         rig.console.print(table_of_tests(tests))
         n_passed = sum(test.has_passed for test in tests)
-        rig.console.print(f"{n_passed} of {len(chosen)} legs passed; play was not measured: drives tell one position")
+        for line in identity_lines({test.leg: test.identity for test in tests}):
+            rig.console.print(line, soft_wrap=True)
+        rig.console.print(
+            f"{n_passed} of {counted(len(chosen), 'leg')} passed. Play was not measured: drives tell one position."
+        )
     _leave(is_complete=n_passed == len(chosen))
 
 
@@ -209,14 +228,17 @@ def _carry_out(
         silent = {leg: state for leg, state in states.items() if isinstance(state, str)}
         if silent:
             rig.console.print(table_of_words("does not answer", silent))
-            raise ConfigError(f"{len(silent)} of {len(states)} drives do not answer: nothing was moved")
+            raise ConfigError(
+                f"{len(silent)} of {counted(len(states), 'drive')} without an answer: nothing was moved; look at power "
+                "and cable, or name the other legs only"
+            )
         orders = [
             MoveOrder(leg, state.position_m, target_of(state.position_m))
             for leg, state in states.items()
             if isinstance(state, DriveState)
         ]
         rig.console.print(table_of_orders(orders))
-        _ask(f"{len(orders)} legs move. Go on?", is_yes=is_yes)
+        _ask(f"{counted(len(orders), 'leg')} to move. Go on?", is_yes=is_yes)
         results = _execute(rig, orders)
         rig.console.print(table_of_results(results))
     _leave(is_complete=all(result.outcome is MoveOutcome.ARRIVED for result in results))
@@ -242,7 +264,7 @@ def _stop_hardware(config: InstrumentConfig) -> tuple[dict[Leg, str], list[str]]
 def _execute(rig: _Rig, orders: Sequence[MoveOrder]) -> list[MoveResult]:
     told: list[MoveResult] = []
     try:
-        with rig.console.status(f"{len(orders)} legs move; Ctrl-C stops all drives"):
+        with rig.console.status(f"{counted(len(orders), 'leg')} on the way; Ctrl-C stops all drives"):
             return rig.mover.execute(orders, told.append, lambda: None)
     except (KeyboardInterrupt, SystemExit):
         rig.console.print(table_of_results(told))
@@ -264,13 +286,18 @@ def _rig(config: str, *, is_twin: bool) -> Iterator[_Rig]:
             buses = stack.enter_context(build_twin_actuators(loaded, drives))
         else:
             clock = SystemMonotonicClock()
-            buses = stack.enter_context(open_actuators(loaded))
+            try:
+                buses = stack.enter_context(open_actuators(loaded))
+            except ConfigError as problem:
+                raise ConfigError(f"{problem}\nTo try the command without hardware, add --twin") from None
         for bus in buses:
             if bus.unreachable:
-                legs = ", ".join(short_name(leg) for leg in bus.unreachable)
-                console.print(Text(f"{bus.name}: no proper answer from legs {legs}", style="yellow"))
+                legs = legs_in_words(bus.unreachable)
+                console.print(Text(f"{bus.name}: no proper answer from {legs}", style="yellow"), soft_wrap=True)
         stack.enter_context(_ended_by_sigterm())
-        yield _Rig(Mover(buses, clock, settings, StopSwitch()), settings, console)
+        prefix = "twin/" if is_twin else ""
+        bus_names = {drive.leg: f"{prefix}{bus.name}" for bus in build_bus_settings(loaded) for drive in bus.drives}
+        yield _Rig(Mover(buses, clock, settings, StopSwitch()), settings, console, bus_names)
 
 
 @contextmanager
@@ -285,6 +312,11 @@ def _ended_by_sigterm() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
+def _refuse_no_number(option: str, length_mm: float) -> None:
+    if not math.isfinite(length_mm):
+        raise ConfigError(f"{option} {length_mm}: is no length; give a number of mm")
+
+
 def _standing(state: DriveState | str) -> str:
     if isinstance(state, str):
         return state
@@ -292,8 +324,17 @@ def _standing(state: DriveState | str) -> str:
 
 
 def _ask(question: str, *, is_yes: bool) -> None:
-    if not is_yes:
+    if is_yes:
+        return
+    try:
         typer.confirm(question, abort=True)
+    except typer.Abort:
+        if sys.stdin.isatty():
+            raise
+        typer.echo()
+        raise ConfigError(
+            "nothing was moved: nobody answered yes. Without a terminal, write the answer beforehand: --yes"
+        ) from None
 
 
 def _leave(*, is_complete: bool) -> None:

@@ -29,6 +29,7 @@ from namod_ctl.cycle.campaign_parts import CampaignSettings
 from namod_ctl.cycle.machine import FINAL
 from namod_ctl.cycle.record import RecordSettings
 from namod_ctl.store.campaign import CampaignStore
+from namod_ctl.store.import_namod import KeepFrames
 from namod_ctl.twin.settings import TwinSettings
 
 DEFAULT_CONFIG = "fact_actuated"
@@ -77,6 +78,13 @@ def align(
         Approve | None,
         typer.Option(help="auto: corrections are carried out; ask: a person approves each one.  [auto, or as begun]"),
     ] = None,
+    keep_frames: Annotated[
+        KeepFrames | None,
+        typer.Option(
+            help="Frames to keep in the runs of all cycles; the live page shows the newest ones in any case.  [none, "
+            "or as begun]"
+        ),
+    ] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Of the twin: another seed is another telescope.")] = None,
     twin_settings: Annotated[
         Path | None, typer.Option("--twin-settings", metavar="FILE", help="Faults and sky of the twin, a TOML file.")
@@ -102,7 +110,7 @@ def align(
         store = start.store
         if _has_ended(store, console):
             return
-        wishes = _wishes(store, records, cycles, approve)
+        wishes = _wishes(store, records, cycles, approve, keep_frames)
         switch = StopSwitch()
         view = stack.enter_context(AlignView(console))
         opened = stack.enter_context(
@@ -171,14 +179,26 @@ def _has_ended(store: CampaignStore, console: Console) -> bool:
     raise ConfigError(f"{store.path}: is {why}; {remedy}")
 
 
-def _wishes(store: CampaignStore, records: int | None, cycles: int | None, approve: Approve | None) -> CampaignSettings:
+def _wishes(
+    store: CampaignStore,
+    records: int | None,
+    cycles: int | None,
+    approve: Approve | None,
+    keep_frames: KeepFrames | None,
+) -> CampaignSettings:
     """What the crew wishes; noted in the campaign, which goes on with it after a restart."""
-    given = {"records": records, "cycles": cycles, "approve": approve}
-    wishes: dict[str, Any] = {"records": DEFAULT_RECORDS, "cycles": DEFAULT_CYCLES, "approve": Approve.AUTO}
+    given = {"records": records, "cycles": cycles, "approve": approve, "keep_frames": keep_frames}
+    wishes: dict[str, Any] = {
+        "records": DEFAULT_RECORDS,
+        "cycles": DEFAULT_CYCLES,
+        "approve": Approve.AUTO,
+        "keep_frames": KeepFrames.NONE,
+    }
     wishes |= json.loads(store.note(NOTE_WISHES) or "{}")
     wishes |= {name: wish for name, wish in given.items() if wish is not None}
     store.set_note(NOTE_WISHES, json.dumps(wishes))
-    return CampaignSettings(RecordSettings(), wishes["records"], wishes["cycles"], wishes["approve"] == Approve.ASK)
+    record = RecordSettings(keep_frames=wishes["keep_frames"] == KeepFrames.ALL)
+    return CampaignSettings(record, wishes["records"], wishes["cycles"], wishes["approve"] == Approve.ASK)
 
 
 @contextmanager

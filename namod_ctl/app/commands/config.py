@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Annotated
 
 import typer
@@ -11,11 +12,14 @@ from rich.text import Text
 
 from namod_ctl.app.build import build_instrument
 from namod_ctl.app.build_actuators import check_ports
-from namod_ctl.app.config import builtin_names, load_config
+from namod_ctl.app.config import builtin_names, find_config, load_config
 from namod_ctl.app.config_summary import Summary, summarize, warnings_of
+from namod_ctl.core.errors import ConfigError
 
 app = typer.Typer(
-    add_completion=False, help="Check the config of an instrument, list those that come with the program."
+    add_completion=False,
+    rich_markup_mode="markdown",
+    help="Check the config of an instrument, list those that come with the program.",
 )
 
 
@@ -30,7 +34,10 @@ def check(
 
     Example: namod-ctl config check fact_actuated
     """
-    loaded = load_config(config)
+    try:
+        loaded = load_config(config)
+    except ConfigError as error:
+        raise _listed(config, str(error).splitlines()) from None
     if ports:
         check_ports(loaded)
     instrument = build_instrument(loaded)
@@ -40,6 +47,15 @@ def check(
     for warning in warnings_of(loaded, instrument):
         console.print(Text(f"warning: {warning}", style="yellow"))
     console.print(Text(f"{config}: valid", style="green"))
+
+
+def _listed(config: str, problems: list[str]) -> ConfigError:
+    """The problems below each other, none with the config's own name before it, which is said once."""
+    if len(problems) == 1:
+        return ConfigError(problems[0])
+    path = find_config(config)
+    lines = [re.sub(rf"^{re.escape(str(path))}( \(extends [^)]*\))?: ", "", problem) for problem in problems]
+    return ConfigError("\n  ".join([f"{config}: these are its problems:", *lines]))
 
 
 @app.command("list")

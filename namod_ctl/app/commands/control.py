@@ -1,4 +1,4 @@
-"""`namod-ctl stop`, `pause`, `resume`, `approve`, `refuse`, `release`, `done`: word to a campaign."""
+"""`namod-ctl stop`, `pause`, `resume`, `approve`, `refuse`, `release`, `done`: word to a campaign, or a recording."""
 
 from __future__ import annotations
 
@@ -12,23 +12,40 @@ from namod_ctl.app.campaign_choice import CAMPAIGN_HELP, choose_campaign
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.cycle.control import ALL, Answer, Request, RequestKind, SentRequest, send
-from namod_ctl.cycle.machine import CampaignMachine
+from namod_ctl.cycle.machine import FINAL, CampaignMachine
+from namod_ctl.cycle.recording_control import pid_at_work
+from namod_ctl.cycle.turn_marks import mark, unmark
 from namod_ctl.store.campaign import CampaignStore
 from namod_ctl.store.campaign_lock import running_pid
+from namod_ctl.store.folders import is_run
 
 PATIENCE_S = 10.0  # the other process looks every 50 ms; then it may have drives to halt
 LOOK_S = 0.02
 EXIT_REFUSED = 2
 
-_Campaign = Annotated[Path | None, typer.Argument(metavar="[CAMPAIGN]", help=CAMPAIGN_HELP, show_default=False)]
+_Campaign = Annotated[Path | None, typer.Argument(metavar="CAMPAIGN", help=CAMPAIGN_HELP, show_default=False)]
 
 
-def stop(campaign: _Campaign = None) -> None:
-    """Halt every drive at once and hold the campaign until somebody releases it.
+def stop(
+    path: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="CAMPAIGN|RUN", help=f"Folder of a run that is recorded, or: {CAMPAIGN_HELP}", show_default=False
+        ),
+    ] = None,
+) -> None:
+    """Halt every drive at once and hold the campaign until somebody releases it; or end a recording in order.
+
+    A recording ends as with its first Ctrl-C: after the record in work, and all its records are kept.
 
     Example: namod-ctl stop CAMPAIGN
     """
-    _ask_running(campaign, RequestKind.STOP)
+    if path is not None and is_run(path):
+        if pid_at_work(path) is None:
+            _refuse(f"nobody records into {path}, so there is nothing to stop")
+        _ask(path, Request(kind=RequestKind.STOP))
+        return
+    _ask_running(path, RequestKind.STOP)
 
 
 def pause(campaign: _Campaign = None) -> None:
@@ -93,24 +110,27 @@ def done(
         str | None, typer.Option("--facet", metavar="IDS", help="Facets whose bolts were turned, such as 13,31.")
     ] = None,
     is_all: Annotated[bool, typer.Option("--all", help="All turns that were asked for are done.")] = False,
+    undo: Annotated[
+        bool, typer.Option("--undo", help="They are not done after all; until the campaign goes on this can be said.")
+    ] = False,
 ) -> None:
-    """Say which of the turns that were asked for are done.
+    """Say which of the turns that were asked for are done, or take it back.
 
     Example: namod-ctl done CAMPAIGN --facet 13,31
     """
     if (facet is not None) == is_all:
         raise ConfigError("say either which facets are done (--facet 13,31) or that all are (--all)")
-    facet_ids = None if facet is None else _facet_ids(facet)
+    facet_ids: tuple[int, ...] | Literal["all"] = ALL if facet is None else _facet_ids(facet)
     path = choose_campaign(campaign)
     if running_pid(path) is not None:
-        wanted: tuple[int, ...] | Literal["all"] = ALL if facet_ids is None else facet_ids
-        _ask(path, Request(kind=RequestKind.DONE, facet_ids=wanted))
+        kind = RequestKind.NOT_DONE if undo else RequestKind.DONE
+        _ask(path, Request(kind=kind, facet_ids=facet_ids))
         return
     with CampaignStore.open(path, read_only=False) as store:
-        news = store.mark_done(facet_ids)
-        waiting = [turns.facet_id for turns in store.turns() if not turns.is_done]
-    typer.echo(f"Done: {_listed(news)}. Still to be done: {_listed(waiting)}.")
-    if not waiting:
+        typer.echo((unmark if undo else mark)(store, facet_ids))
+        is_complete = all(turns.is_done for turns in store.turns())
+        has_ended = store.last_state() in FINAL
+    if is_complete and not has_ended:
         typer.echo(f"Go on with 'namod-ctl align --resume {path}'.")
 
 
@@ -146,7 +166,7 @@ def _wait_for_answer(path: Path, sent: SentRequest) -> Answer | None:
     """The answer; None when the request was taken and nobody answered."""
     deadline_s = time.monotonic() + PATIENCE_S
     while True:
-        pid = running_pid(path)  # before the looks: one who answers and ends at once has answered
+        pid = pid_at_work(path)  # before the looks: one who answers and ends at once has answered
         if (answer := sent.answer()) is not None:
             return answer
         is_late = time.monotonic() > deadline_s
@@ -156,16 +176,18 @@ def _wait_for_answer(path: Path, sent: SentRequest) -> Answer | None:
     if sent.is_taken():
         return None
     kind = sent.request.kind
+    who = f"process {pid}" if pid else f"the program at work on {path}"
     if pid is not None and kind is RequestKind.STOP:
+        kill = f" with 'kill {pid}'" if pid else ""
         _refuse(
-            f"process {pid} has not looked for {PATIENCE_S:g} s; the request to stop stays until it does. Use the "
-            f"telescope's own emergency stop if something moves, and end the process with 'kill {pid}'"
+            f"{who} has not looked for {PATIENCE_S:g} s; the request to stop stays until it does. Use the telescope's "
+            f"own emergency stop if something moves, and end the process{kill}"
         )
     if sent.withdraw():
         _refuse(
             f"the process that worked on {path} has ended before it took this; nothing was done"
             if pid is None
-            else f"process {pid} has not looked for {PATIENCE_S:g} s; the request was withdrawn, try again"
+            else f"{who} has not looked for {PATIENCE_S:g} s; the request was withdrawn, try again"
         )
     return None
 
@@ -176,10 +198,6 @@ def _facet_ids(text: str) -> tuple[int, ...]:
         if not (word.isascii() and word.isdigit() and int(word) < 2**31):
             raise ConfigError(f"--facet {text}: {word!r} is no facet id; give ids with commas between, such as 13,31")
     return tuple(dict.fromkeys(int(word) for word in words))
-
-
-def _listed(facet_ids: list[int]) -> str:
-    return f"facet {', '.join(map(str, facet_ids))}" if facet_ids else "none"
 
 
 def _refuse(why: str) -> NoReturn:

@@ -34,7 +34,7 @@ class ExportFormat(StrEnum):
 
 
 def export(
-    run: Annotated[Path, typer.Argument(help="Folder of a run that was reconstructed.")],
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run that was reconstructed.")],
     form: Annotated[
         ExportFormat,
         typer.Option("--format", help="mars: reflector file with the estimated normals; ecsv, fits: table of facets."),

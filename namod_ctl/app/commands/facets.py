@@ -17,6 +17,7 @@ from namod_ctl.store.facet_tables import read_polygon_table
 
 app = typer.Typer(
     add_completion=False,
+    rich_markup_mode="markdown",
     help="Make and check the map of the facets in the reflector camera's image.",
     no_args_is_help=True,
 )
@@ -105,7 +106,12 @@ def propose(
 def check(
     config: ConfigOption = "fact",
     polygons: Annotated[
-        Path | None, typer.Argument(help="CSV file of a map for this instrument. Default: the config's own.")
+        Path | None,
+        typer.Argument(
+            metavar="[MAP]",
+            help="CSV file of a map for this instrument. Default: the config's own.",
+            show_default=False,
+        ),
     ] = None,
 ) -> None:
     """Check a map: every facet once, in the image, not crossing itself, not on another facet.

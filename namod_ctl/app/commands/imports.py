@@ -44,7 +44,7 @@ ForceOption = Annotated[
 
 @app.command("maps")
 def maps(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with mirror_ID<id>_response_map.csv files.")],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with files such as mirror_ID13_response_map.csv.")],
     out: OutOption,
     config: ConfigOption = "fact",
     force: ForceOption = False,

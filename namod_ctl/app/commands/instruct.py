@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from datetime import date
 from pathlib import Path
 from typing import Annotated
 
@@ -38,7 +39,7 @@ _MOST_FRAMES = 30  # of a run are laid over each other; more show nothing new
 
 
 def instruct(
-    run: Annotated[Path, typer.Argument(help="Folder of a run that was reconstructed.")],
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run that was reconstructed.")],
     image: Annotated[
         Path | None,
         typer.Option(help="Picture of the reflector, the camera's whole frame at any size. Default: the run's frames."),
@@ -47,7 +48,8 @@ def instruct(
 ) -> None:
     """Write instructions.csv, instructions.png and instructions.pdf for the people who turn the bolts.
 
-    Facets without a trustworthy estimate are marked "do not turn" and carry no numbers.
+    Facets without a trustworthy estimate are marked "do not turn" and carry no numbers. Picture and sheets show turns
+    as the goniometer of the config can set them; the CSV holds whole degrees.
 
     Example: namod-ctl instruct runs/2014-05 --image reflector.png
     """
@@ -76,7 +78,7 @@ def write_instructions(
     files = {
         CSV_FILE: instructions_to_csv(instructions, n_bolts).encode(),
         PNG_FILE: figure_to_png(draw_instructions(instrument, instructions, picture, headline)),
-        PDF_FILE: sheets_to_pdf(instrument, instructions, headline),
+        PDF_FILE: sheets_to_pdf(instrument, instructions, headline, date.today()),
     }
     write_results(folder, files)
     return instructions

@@ -31,6 +31,7 @@ from namod_ctl.core.units import arcmin_to_rad, deg_to_rad
 from namod_ctl.cycle.live_estimate import LiveEstimator
 from namod_ctl.cycle.progress import Progress
 from namod_ctl.cycle.record import SESSION_GAP_S, Equipment, Recorder, StopRule
+from namod_ctl.cycle.recording_control import RecordingControl
 from namod_ctl.cycle.replay import CAMERAS, ReplayCamera, ReplayClock, replayable_records
 from namod_ctl.optics.instrument import Instrument
 from namod_ctl.store.folders import check_output, discard, free_sibling, put_in_place
@@ -111,7 +112,8 @@ def record(
 ) -> None:
     """Record image pairs of a star and of the reflector into a run.
 
-    Ctrl-C stops after the record in work; a second one stops at once, and the run keeps all records before it.
+    Ctrl-C stops after the record in work, as 'namod-ctl stop RUN' from another terminal does; a second one stops at
+    once, and the run keeps all records before it.
 
     Example: namod-ctl record --twin --twin-settings config/twin/rough_night.toml --out RUN --records 300
     """
@@ -150,8 +152,14 @@ def record(
         if dashboard:
             address = stack.enter_context(dashboard_beside(session.store.path))
             console.print(f"live page: {address}", soft_wrap=True, markup=False)
+        control = stack.enter_context(RecordingControl(session.store.path, recorder.ask_to_stop))
         with TerminalView(console, title) as view, _stopped_by_ctrl_c(recorder, console):
-            reason = recorder.record(stop, view.show)
+
+            def on_progress(progress: Progress) -> None:
+                control.look()
+                view.show(progress)
+
+            reason = recorder.record(stop, on_progress)
             progress = recorder.progress()
             view.show(progress, now=True)
         session.store.check_in_place()

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from namod_ctl.app.campaign_choice import CAMPAIGN_HELP, choose_campaign
+from namod_ctl.app.number_ranges import counted, legs_in_words, runs_in_words
+from namod_ctl.core.drives import Leg
 from namod_ctl.core.motion import MoveOutcome
 from namod_ctl.core.units import rad2_to_arcmin2
 from namod_ctl.cycle.machine import FINAL, STATES
@@ -22,6 +23,8 @@ from namod_ctl.store.campaign_rows import TRANSITION
 
 SCHEMA = "namod-status/1"
 N_EVENTS = 10
+
+_Said = TypeVar("_Said")
 
 
 def status(
@@ -146,33 +149,50 @@ def _print(standing: Mapping[str, Any]) -> None:
     console.print(f"Running: {process if standing['is_running'] else 'no'}")
     console.print(f"Next:    {standing['next']}")
     if standing["cycles"]:
-        console.print(_cycle_table(standing["cycles"]))
-    for facet_id, why in standing["refused_facets"].items():
-        console.print(f"Refused: facet {facet_id}: {why}")
-    for leg in standing["legs_not_arrived"]:
-        console.print(f"Leg:     facet {leg['facet_id']} leg {leg['leg']}: {leg['outcome']}; {leg['detail']}")
+        console.print("A_sigma, the area of the point spread function, in square minutes of arc:")
+        _print_cycles(console, standing["cycles"])
+    for why, facet_ids in _by_words((int(facet_id), why) for facet_id, why in standing["refused_facets"].items()):
+        noun = "facet" if len(facet_ids) == 1 else "facets"
+        console.print(f"Refused: {noun} {runs_in_words(facet_ids)}: {why}")
+    for words, legs in _by_words(
+        (Leg(leg["facet_id"], leg["leg"] - 1), f"{leg['outcome'].replace('_', ' ')}; {leg['detail']}".rstrip("; "))
+        for leg in standing["legs_not_arrived"]
+    ):
+        console.print(f"Not where they should be: {legs_in_words(legs)}: {words}")
     if standing["turns_to_do"] or standing["turns_done"]:
         n_done, n_to_do = len(standing["turns_done"]), len(standing["turns_to_do"])
-        to_do = f"; to do: {', '.join(map(str, standing['turns_to_do']))}" if n_to_do else ""
-        console.print(f"Bolts:   {n_done} of {n_done + n_to_do} facets done{to_do}")
+        to_do = f"; to do: {runs_in_words(standing['turns_to_do'])}" if n_to_do else ""
+        console.print(f"Bolts:   {n_done} of {counted(n_done + n_to_do, 'facet')} done{to_do}")
+    if standing["events"]:
+        console.print("What happened last (UTC):")
     for event in standing["events"]:
-        console.print(f"{event['time_utc'][:19]}  {event['kind']}: {event['text']}")
+        what, text = event["kind"].replace("_", " "), event["text"]
+        if event["kind"] == TRANSITION:  # "this -> that: why"
+            way, _, text = text.partition(": ")
+            what = way.rpartition(" -> ")[2].replace("_", " ")
+        console.print(f"  {event['time_utc'][:19].replace('T', ' ')}  {what}: {text}")
 
 
-def _cycle_table(cycles: list[dict[str, Any]]) -> Table:
-    table = Table("cycle", "records", "A_sigma [arcmin2]", "predicted", "ideal mirrors", "decision")
+def _by_words(said: Iterable[tuple[_Said, str]]) -> list[tuple[str, list[_Said]]]:
+    """Of what the same is said, together, in the order of first appearance."""
+    groups: dict[str, list[_Said]] = {}
+    for what, words in said:
+        groups.setdefault(words, []).append(what)
+    return list(groups.items())
+
+
+def _print_cycles(console: Console, cycles: list[dict[str, Any]]) -> None:
+    """Two lines per cycle: numbers below each other, and the whole decision, which is too long for a column."""
+    console.print(f"{'cycle':>7}  {'records':>7}  {'measured':>16}  {'predicted':>9}  {'ideal mirrors':>13}")
     for cycle in cycles:
         area = cycle["a_sigma_arcmin2"]
         spread = f" +- {area['now_uncertainty']:.2f}" if area["now_uncertainty"] is not None else ""
-        table.add_row(
-            str(cycle["cycle"]),
-            str(cycle["n_records"]),
-            _area(area["now"]) + spread,
-            _area(area["predicted_after_correction"]),
-            _area(area["limit"]),
-            cycle["decision"].split(":")[0],
+        console.print(
+            f"{cycle['cycle']:>7}  {cycle['n_records']:>7}  {_area(area['now']) + spread:>16}  "
+            f"{_area(area['predicted_after_correction']):>9}  {_area(area['limit']):>13}"
         )
-    return table
+        if cycle["decision"]:
+            console.print(f"         {cycle['decision']}")
 
 
 def _area(area_arcmin2: float | None) -> str:

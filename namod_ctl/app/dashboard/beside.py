@@ -15,7 +15,7 @@ from pathlib import Path
 from namod_ctl.app.dashboard.guard import Rules
 from namod_ctl.app.dashboard.server import build_server, listen
 
-NICENESS = 10
+NICENESS = 19
 """The recording comes first, as it does before the live estimate."""
 
 

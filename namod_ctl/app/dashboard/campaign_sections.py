@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
+from collections.abc import Mapping
 from typing import Any
+from zlib import crc32
 
 from namod_ctl.app.alignment_files import alignment_from_json
 from namod_ctl.app.commands.status import describe
-from namod_ctl.app.dashboard.numbers import short, shorts
-from namod_ctl.core.motion import MoveOutcome
-from namod_ctl.core.units import m_to_mm, rad2_to_arcmin2
+from namod_ctl.app.dashboard.numbers import short
+from namod_ctl.core.drives import Leg
+from namod_ctl.core.motion import MoveOutcome, MoveResult
+from namod_ctl.core.units import k_to_celsius, m_to_mm, rad2_to_arcmin2
 from namod_ctl.cycle.control import RequestKind
 from namod_ctl.cycle.machine import FINAL, STATES
 from namod_ctl.reconstruction.alignment import Alignment
 from namod_ctl.store.campaign import CampaignStore
-from namod_ctl.store.campaign_rows import TRANSITION, Cycle, Event
+from namod_ctl.store.campaign_rows import TRANSITION, Cycle, Event, JournaledOrder
+from namod_ctl.store.live_legs import SeenLeg
 
 N_EVENTS = 40
 
@@ -22,7 +27,7 @@ _ASKED_IN = {
     "recording": (RequestKind.PAUSE,),
     "paused": (RequestKind.RESUME,),
     "awaiting_approval": (RequestKind.APPROVE, RequestKind.REFUSE),
-    "awaiting_operator": (RequestKind.DONE,),
+    "awaiting_operator": (RequestKind.DONE, RequestKind.NOT_DONE),
 }
 """What makes sense in which state; to stop always does while somebody is at work. `release` is not for a page: who
 releases has looked at the telescope."""
@@ -45,7 +50,8 @@ def what_next(state: str, n_to_turn: int, *, is_running: bool) -> str:
         return "nobody is at work on it: 'namod-ctl align --resume' in a terminal goes on"
     return {
         "awaiting_approval": "look at the prediction, then approve or refuse it: here, or in a terminal",
-        "awaiting_operator": f"bolts of {n_to_turn} facets are turned; mark each facet that is done",
+        "awaiting_operator": f"bolts of {n_to_turn} {'facet is' if n_to_turn == 1 else 'facets are'} turned; mark each "
+        "facet that is done on the work sheet",
         "paused": "resume it when the recording shall go on",
     }.get(state, "it goes on by itself")
 
@@ -66,10 +72,18 @@ def standing(store: CampaignStore, pid: int | None) -> dict[str, Any]:
         "step": transition.id if transition else 0,
         "commands": commands_in(said["state"], is_running=said["is_running"]),
         "refused": [{"id": int(facet_id), "why": why} for facet_id, why in said["refused_facets"].items()],
-        "turns": [
-            {"id": turn.facet_id, "turns_deg": shorts(turn.turns_deg), "is_done": turn.is_done} for turn in turns
-        ],
+        "turns_of": turns[0].cycle if turns else None,
+        "turns": [{"id": turn.facet_id, "is_done": turn.is_done} for turn in turns],
     }
+
+
+def sheets(store: CampaignStore, cycles: list[Cycle]) -> list[dict[str, int]]:
+    """Cycles that have a work sheet for the bolts, and the fingerprint of what it is made from."""
+    return [
+        {"key": cycle.number, "fingerprint": crc32(cycle.alignment_json.encode())}
+        for cycle in cycles
+        if cycle.alignment_json is not None and store.turns(cycle.number)
+    ]
 
 
 def cycle_table(cycles: list[Cycle]) -> list[dict[str, Any]]:
@@ -101,27 +115,66 @@ def alignments_of(cycles: list[Cycle], known: dict[int, tuple[int, Alignment]]) 
 
 
 def actuators(store: CampaignStore) -> dict[str, Any]:
-    """Every leg that was ever ordered to move: its last order, what came of it, and where it is."""
+    """Every leg that was ever ordered to move or whose drive was read: its last order, and what its drive said last."""
     last = {journaled.order.leg: journaled for journaled in store.orders()}
-    legs = []
+    seen = store.seen_legs()
+    latest = max((journaled.cycle for journaled in last.values()), default=None)
+    legs = [_leg(leg, last.get(leg), seen.get(leg)) for leg in sorted({*last, *seen})]
+    counts = Counter(leg["outcome"] for leg in legs if leg["outcome"])
+    return {"cycle": latest, "counts": dict(counts), "drives": dict(_drive_counts(seen)), "legs": legs}
+
+
+def _leg(leg: Leg, journaled: JournaledOrder | None, seen: SeenLeg | None) -> dict[str, Any]:
+    result = None if journaled is None else journaled.result
+    outcome = "" if journaled is None else (MoveOutcome.UNKNOWN if result is None else result.outcome).value
+    position_m = math.nan if result is None else result.readback_m
+    if seen is not None and seen.state is not None:
+        position_m = seen.state.position_m
+    return {
+        "facet": leg.facet_id,
+        "leg": leg.index + 1,
+        "target_mm": None if journaled is None else short(m_to_mm(journaled.order.target_m)),
+        "position_mm": short(m_to_mm(position_m)),
+        "outcome": outcome,
+        "detail": "ordered, not read back yet" if journaled is not None and result is None else _detail(result),
+        "drive": "" if seen is None else _drive_in_words(seen),
+        "is_bad": outcome not in ("", MoveOutcome.ARRIVED.value) or (seen is not None and _is_unwell(seen)),
+    }
+
+
+def _detail(result: MoveResult | None) -> str:
+    return "" if result is None else result.detail
+
+
+def _is_unwell(seen: SeenLeg) -> bool:
+    return seen.state is None or bool(seen.state.faults) or not seen.state.is_homed
+
+
+def _drive_in_words(seen: SeenLeg) -> str:
+    state = seen.state
+    if state is None:
+        return f"no word from its drive: {seen.silence}"
+    words = ["moves" if state.is_moving else "stands still", *state.faults]
+    if not state.is_homed:
+        words.append("not homed")
+    if state.temperature_k is not None:
+        words.append(f"{k_to_celsius(state.temperature_k):.0f} °C")
+    return ", ".join(words)
+
+
+def _drive_counts(seen: Mapping[Leg, SeenLeg]) -> Counter[str]:
+    """Drives by what matters most of each, as a person would count them."""
     counts: Counter[str] = Counter()
-    latest = max((journaled.cycle for journaled in last.values()), default=0)
-    for leg, journaled in sorted(last.items()):
-        result = journaled.result
-        outcome = MoveOutcome.UNKNOWN if result is None else result.outcome
-        counts[outcome.value] += 1
-        legs.append(
-            {
-                "facet": leg.facet_id,
-                "leg": leg.index + 1,
-                "cycle": journaled.cycle,
-                "target_mm": short(m_to_mm(journaled.order.target_m)),
-                "position_mm": None if result is None else short(m_to_mm(result.readback_m)),
-                "outcome": outcome.value,
-                "detail": "ordered, not read back yet" if result is None else result.detail,
-            }
-        )
-    return {"cycle": latest, "counts": dict(counts), "legs": legs}
+    for each in seen.values():
+        if each.state is None:
+            counts["silent"] += 1
+        elif each.state.faults:
+            counts["with a fault"] += 1
+        elif not each.state.is_homed:
+            counts["not homed"] += 1
+        else:
+            counts["moving" if each.state.is_moving else "well and still"] += 1
+    return counts
 
 
 def journal(events: list[Event]) -> list[dict[str, Any]]:

@@ -69,7 +69,6 @@ def facet_table(alignment: Alignment, history: Mapping[int, Alignment]) -> list[
                 if flag & facet.flags
             ],
             "is_refused": facet.flags.forbids_turning,
-            "turns_deg": shorts(facet.bolt_turn_deg),
             "remarks": list(facet.remarks),
             "history": [
                 [cycle, short(rad_to_arcmin(misalignment_rad(facets[facet.facet_id], history[cycle].axis_rad)))]
@@ -99,7 +98,6 @@ def rough_table(instrument: Instrument, centres_rad: Mapping[int, Array]) -> lis
             "n_records": None,
             "flags": [],
             "is_refused": False,
-            "turns_deg": [],
             "remarks": [],
             "history": [],
         }

@@ -44,10 +44,13 @@ class Rules:
         What a request that changes something must know.
     is_loopback
         The page is served to this computer only.
+    max_body_bytes
+        So much may be sent at once.
     """
 
     token: str
     is_loopback: bool
+    max_body_bytes: int = MAX_BODY_BYTES
 
 
 def is_loopback(host: str) -> bool:
@@ -97,8 +100,8 @@ def refusal(method: str, headers: Headers, rules: Rules) -> tuple[int, str] | No
     if headers.get("content-type", "").split(";")[0].strip().lower() != "application/json":
         return 415, "commands are sent as application/json"
     length = headers.get("content-length", "0")
-    if not length.isdigit() or int(length) > MAX_BODY_BYTES:
-        return 413, f"a command has at most {MAX_BODY_BYTES} bytes"
+    if not length.isdigit() or int(length) > rules.max_body_bytes:
+        return 413, f"at most {rules.max_body_bytes} bytes can be sent"
     return None
 
 

@@ -1,4 +1,4 @@
-"""Kept frames as pictures that a phone can load: smaller, as JPEG, and brightened, as nearly all of them is night."""
+"""Frames as pictures that a phone can load: those kept with the records, else the newest that the recorder shows."""
 
 from __future__ import annotations
 
@@ -6,16 +6,11 @@ from collections import OrderedDict
 from pathlib import Path
 from typing import Final
 
-import cv2
-import numpy as np
-
 from namod_ctl.core.errors import StoreError
+from namod_ctl.store.live_pictures import live_picture, picture_of
 from namod_ctl.store.run import RunStore
 
-MAX_COLUMNS: Final = 960
-_QUALITY: Final = 75
 _MAX_KEPT: Final = 8
-_BRIGHTENED: Final = np.rint(255.0 * (np.arange(256) / 255.0) ** 0.5).astype(np.uint8)
 
 
 class Pictures:
@@ -25,22 +20,21 @@ class Pictures:
         self._kept: OrderedDict[tuple[Path, str, int], bytes] = OrderedDict()
 
     def picture(self, run: Path, camera: str, index: int) -> bytes | None:
-        """The square root of the frame as JPEG, at most `MAX_COLUMNS` wide; None when it is not there or unreadable."""
+        """The frame of a record as JPEG, brightened; None when it is not there, not any more, or unreadable."""
         key = (run, camera, index)
         if key not in self._kept:
-            try:
-                with RunStore.open(run) as store:
-                    frame = store.frame(index, camera)
-            except StoreError:
+            data = live_picture(run, index, camera) or _of_kept_frame(run, camera, index)
+            if data is None:
                 return None
-            shrink = min(1.0, MAX_COLUMNS / frame.shape[1])
-            if shrink < 1.0:
-                size = (round(frame.shape[1] * shrink), round(frame.shape[0] * shrink))
-                frame = cv2.resize(frame, size, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
-            is_encoded, data = cv2.imencode(".jpg", _BRIGHTENED[frame], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-            if not is_encoded:
-                return None
-            self._kept[key] = data.tobytes()
+            self._kept[key] = data
             while len(self._kept) > _MAX_KEPT:
                 self._kept.popitem(last=False)
         return self._kept[key]
+
+
+def _of_kept_frame(run: Path, camera: str, index: int) -> bytes | None:
+    try:
+        with RunStore.open(run) as store:
+            return picture_of(store.frame(index, camera))
+    except StoreError:
+        return None

@@ -16,15 +16,18 @@ from namod_ctl.app.config import InstrumentConfig
 from namod_ctl.app.dashboard.numbers import short, shorts
 from namod_ctl.app.terminal import star_brightness, steering
 from namod_ctl.core.flags import REJECT_REASON_MEANING, RejectReason
-from namod_ctl.core.units import rad_to_arcmin, rad_to_deg
+from namod_ctl.core.units import rad2_to_arcmin2, rad_to_arcmin, rad_to_deg
+from namod_ctl.cycle.live_status import NOTE_LIVE, LiveStatus
 from namod_ctl.cycle.pairs import SourceStatus
 from namod_ctl.cycle.progress import Progress, Tracker
 from namod_ctl.optics.instrument import Instrument
 from namod_ctl.store.database import DATABASE_NAME
+from namod_ctl.store.frames import STAR_CAMERA
 from namod_ctl.store.run import RunStore
 from namod_ctl.store.run_tail import Brightest, RunTail
 
-_NO_WORD = SourceStatus({}, 0, "")  # what cameras drop before it becomes a record is not written down
+_NO_WORD = SourceStatus({}, 0, "")  # what cameras drop before it becomes a record: `LiveStatus` has it
+_NOWHERE = np.full(2, math.nan)
 _MIN_ROUGH = 20  # records
 _CLEARLY = 2.5  # times its mean over all directions, most of which do not light it
 
@@ -43,8 +46,10 @@ class RunGlance:
 
     def __init__(self, path: Path, config: InstrumentConfig, instrument: Instrument, key: int) -> None:
         self.path, self.key, self._instrument = path, key, instrument
-        settings = build_record_settings(config)
-        self._tracker = Tracker(settings.region_radius_rad, 0.0, settings.star_zero_point_mag)
+        self._settings = build_record_settings(config)
+        self._tracker = self._new_tracker(self._settings.region_radius_rad)
+        self._live_text: str | None = None
+        self._live: LiveStatus | None = None
         self._tail = RunTail(path)
         self._n_seen = 0
         self._brightest: dict[int, Brightest] = {}
@@ -66,6 +71,7 @@ class RunGlance:
         """Read what has come; False when nothing was written since the last look."""
         if not self._tail.has_changed():
             return False
+        self._look_at_live()
         for record in self._tail.new_records():
             if math.isfinite(record.star_mid_exposure_s):
                 self._time_s = record.star_mid_exposure_s
@@ -77,6 +83,21 @@ class RunGlance:
             known = self._brightest.get(facet_id)
             self._brightest[facet_id] = found if known is None else known.joined(found)
         return True
+
+    def _look_at_live(self) -> None:
+        """What the recorder says beside its records; with another region the coverage is counted anew."""
+        text = self._tail.note(NOTE_LIVE)
+        if text == self._live_text:
+            return
+        self._live_text = text
+        self._live = None if text is None else LiveStatus.from_json(text)
+        if self._live is not None and self._live.region_radius_rad != self._tracker.region_radius_rad:
+            self._tracker = self._new_tracker(self._live.region_radius_rad)
+            self._tail.rewind()
+            self._n_seen = 0
+
+    def _new_tracker(self, region_radius_rad: float) -> Tracker:
+        return Tracker(region_radius_rad, 0.0, self._settings.star_zero_point_mag)
 
     def rough_centres_rad(self) -> dict[int, NDArray[np.float64]]:
         """Direction of the record in which a facet shone most, shape (2,), by facet id; of those that shone clearly.
@@ -101,6 +122,8 @@ class RunGlance:
         last = tracker.last
         coverage = progress.coverage
         most = max(int(coverage.counts.max()), 1)
+        frames = self._tail.latest_frames()
+        theta_of_picture_rad = self._tail.theta_rad(frames[STAR_CAMERA]) if STAR_CAMERA in frames else _NOWHERE
         return {
             "run": self.key,
             "name": self.path.name,
@@ -110,6 +133,7 @@ class RunGlance:
                 {"reason": reason.value.replace("_", " "), "meaning": REJECT_REASON_MEANING[reason], "n": n}
                 for reason, n in progress.rejected.items()
             ],
+            "live": None if self._live is None else _live_section(self._live),
             "rate_per_min": short(progress.rate_per_min),
             "elapsed_s": short(progress.elapsed_s),
             "star_exposure_s": short(progress.star_exposure_s),
@@ -128,7 +152,8 @@ class RunGlance:
                 "counts": coverage.counts.tolist(),
                 "inside": coverage.is_inside.astype(int).tolist(),
             },
-            "frames": self._tail.latest_frames(),
+            "frames": frames,
+            "frame_star_px": _pixel(self._instrument, theta_of_picture_rad),
         }
 
     def silent_s(self) -> float:
@@ -166,6 +191,34 @@ class RunGlance:
             except OSError:
                 continue
         return written_s
+
+
+def _live_section(live: LiveStatus) -> dict[str, Any]:
+    """What the recorder says beside its records, for JSON."""
+    estimate = live.estimate
+    return {
+        "n_wanted": live.n_wanted,
+        "retaken": [{"cause": cause.value, "n": n} for cause, n in live.dropped.items()],
+        "n_frames_missed": live.n_frames_missed,
+        "rate_per_min": short(live.rate_per_min),
+        "trouble": live.trouble,
+        "warning": live.warning,
+        "is_halted": live.is_halted,
+        "waits_for": live.waits_for,
+        "ended": live.ended,
+        "exposure_limits_s": {role: shorts(limits_s) for role, limits_s in live.exposure_limits_s.items()},
+        "longest_now_s": short(live.longest_now_s),
+        "estimate": None
+        if estimate is None
+        else {
+            "n_records": estimate.n_records,
+            "worst_arcmin": short(rad_to_arcmin(estimate.worst_uncertainty_rad)),
+            "worst_facet": estimate.worst_facet_id,
+            "unseen": list(estimate.unseen_facet_ids),
+            "area_arcmin2": short(rad2_to_arcmin2(estimate.a_sigma_rad2)),
+            "area_uncertainty_arcmin2": short(rad2_to_arcmin2(estimate.a_sigma_uncertainty_rad2)),
+        },
+    }
 
 
 def _pixel(instrument: Instrument, theta_rad: NDArray[np.float64]) -> list[float] | None:

@@ -26,6 +26,7 @@ from namod_ctl.app.dashboard.patience import PatientProtocol
 from namod_ctl.app.dashboard.pictures import Pictures
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.store.frames import REFLECTOR_CAMERA, STAR_CAMERA
+from namod_ctl.store.live_pictures import live_pictures
 
 PAGE: Final = "page.html"
 BODY_WITHIN_S: Final = 5.0
@@ -74,6 +75,11 @@ def build_app(feed: Feed, rules: Rules) -> Starlette:
         found = await feed.ask(lambda watched: watched.facet(facet_id))
         return _nothing_here() if found is None else JSONResponse(found)
 
+    async def sheet(request: Request) -> Response:
+        key = int(request.path_params["key"])
+        found = None if key > _LARGEST else await feed.ask(lambda watched: watched.sheet(key))
+        return _nothing_here() if found is None else JSONResponse(found)
+
     async def frame(request: Request) -> Response:
         camera = request.path_params["camera"]
         key, index = int(request.path_params["key"]), int(request.path_params["index"])
@@ -84,7 +90,10 @@ def build_app(feed: Feed, rules: Rules) -> Starlette:
             return _nothing_here()
         loop = asyncio.get_running_loop()
         data = await loop.run_in_executor(painter, pictures.picture, run, camera, index)
-        return _nothing_here() if data is None else Response(data, media_type="image/jpeg", headers=_FOREVER)
+        if data is not None:
+            return Response(data, media_type="image/jpeg", headers=_FOREVER)
+        # the recorder shows its newest pictures only: a page that was told of the one before did nothing wrong
+        return Response(status_code=204) if live_pictures(run) else _nothing_here()
 
     async def command(request: Request) -> Response:
         reply = await _command(request, feed)
@@ -95,6 +104,7 @@ def build_app(feed: Feed, rules: Rules) -> Starlette:
             Route("/", page),
             Route("/events", events),
             Route("/facet/{facet_id:int}", facet),
+            Route("/sheet/{key:int}", sheet),
             Route("/frame/{key:int}/{camera}/{index:int}", frame),
             Route("/command", command, methods=["POST"]),
             Route("/{name}", page),
@@ -119,8 +129,8 @@ async def _command(request: Request, feed: Feed) -> Reply:
     order = read_order(body)
     if isinstance(order, Reply):
         return order
-    if not feed.watched.is_campaign:
-        return Reply(409, "a plain recording takes no commands; press Ctrl-C in its terminal to end it")
+    if not feed.watched.is_campaign and order.kind != "stop":
+        return Reply(409, "a plain recording can only be stopped")
     step = await feed.ask(lambda watched: watched.step())
     return await carry_out(feed.watched.path, order, step)
 

@@ -21,11 +21,11 @@ from namod_ctl.app.config import InstrumentConfig
 from namod_ctl.app.dashboard import campaign_sections, facet_sections
 from namod_ctl.app.dashboard.run_sections import RunGlance, estimate_of
 from namod_ctl.core.errors import ConfigError, NamodError, StoreError
+from namod_ctl.cycle.recording_control import pid_at_work
 from namod_ctl.optics.instrument import Instrument
 from namod_ctl.reconstruction.alignment import Alignment
 from namod_ctl.store.campaign import CampaignStore
 from namod_ctl.store.campaign_database import CAMPAIGN_DATABASE_NAME, connect_campaign, is_campaign
-from namod_ctl.store.campaign_lock import running_pid
 from namod_ctl.store.database import DATABASE_NAME, store_errors
 from namod_ctl.store.folders import is_run
 from namod_ctl.store.pulse import Pulse
@@ -80,7 +80,7 @@ class Watched:
         self._looked_at_lock_s = -1.0
         self._pid: int | None = None
         self._estimate_id = -1
-        self._has_estimate = self._owes_rough = False
+        self._has_estimate = self._owes_rough = self._was_listening = False
         self._rough_s = -math.inf
 
     def __enter__(self) -> Self:
@@ -143,6 +143,22 @@ class Watched:
             "samples": glance.samples(facet_id) if glance else [],
         }
 
+    def sheet(self, key: int) -> dict[str, Any] | None:
+        """Which bolts are turned after a cycle, or the run (`NO_CAMPAIGN`), and how; None without such a sheet."""
+        # brings matplotlib, which takes a second, and no page but one with sheets needs it
+        from namod_ctl.app.dashboard.work_sheet import work_sheet
+
+        try:
+            if self._campaign is None:
+                text = estimate_of(self.path) if key == NO_CAMPAIGN else None
+                return work_sheet(self.instrument, alignment_from_json(text, str(self.path)), []) if text else None
+            known = self._alignments.get(key)
+            turns = self._campaign.turns(key) if known else []
+        except StoreError:  # a disk that went away: the next look says so
+            return None
+        done = [turn.facet_id for turn in turns if turn.is_done]
+        return work_sheet(self.instrument, known[1], done) if known and turns else None
+
     def step(self) -> int:
         """Number of the journal's last step of the campaign's machine, 0 without one."""
         transition = self._campaign.last_transition() if self._campaign else None
@@ -160,7 +176,6 @@ class Watched:
             "name": self.path.name,
             "source": self._source,
             "version": __version__,
-            "takes_commands": self.is_campaign,
         }
 
     def _check_in_place(self) -> None:
@@ -189,6 +204,7 @@ class Watched:
         found["cycles"] = campaign_sections.cycle_table(cycles)
         found["actuators"] = campaign_sections.actuators(store)
         found["journal"] = campaign_sections.journal(store.events())
+        found["sheets"] = campaign_sections.sheets(store, cycles)
         self._has_estimate = bool(alignments)
         if alignments:
             number = max(alignments)
@@ -217,7 +233,11 @@ class Watched:
 
     def _stand_of_run(self, found: dict[str, Any], glance: RunGlance, *, is_changed: bool) -> None:
         """What a campaign would say of itself has to be guessed for a run: it is being recorded while it grows."""
-        found["standing"] = _run_standing(is_growing=glance.silent_s() < AT_REST_AFTER_S)
+        self._looks_at_lock()
+        self._was_listening |= self._pid is not None
+        # one that takes requests to stop is over when it takes none any more; of others only the silence tells
+        is_growing = self._pid is not None or (not self._was_listening and glance.silent_s() < AT_REST_AFTER_S)
+        found["standing"] = _run_standing(is_growing=is_growing, is_listening=self._pid is not None)
         if is_changed and (number := glance.estimate_id()) != self._estimate_id:
             self._estimate_id = number
             text = estimate_of(self.path)
@@ -226,6 +246,8 @@ class Watched:
                 self._has_estimate = True
                 found["facets"] = _facets(alignment, "this run", {})
                 found["psf"] = facet_sections.whole_psf(alignment, alignment.predicted.a_sigma_rad2, math.nan)
+                if any(len(facet.bolt_turn_deg) for facet in alignment.facets):
+                    found["sheets"] = [{"key": NO_CAMPAIGN, "fingerprint": number}]
 
     def _look_roughly(self, found: dict[str, Any], glance: RunGlance) -> None:
         """Facets as their brightest records show them, now and then: the first estimate comes after the recording."""
@@ -259,7 +281,7 @@ class Watched:
         self._looked_at_lock_s = now_s
         before = self._pid
         with suppress(StoreError):
-            self._pid = running_pid(self.path)
+            self._pid = pid_at_work(self.path)
         return self._pid != before
 
 
@@ -267,7 +289,7 @@ def _facets(alignment: Alignment, of: str, history: Mapping[int, Alignment]) -> 
     return {"of": of, "table": facet_sections.facet_table(alignment, history)}
 
 
-def _run_standing(*, is_growing: bool) -> dict[str, Any]:
+def _run_standing(*, is_growing: bool, is_listening: bool) -> dict[str, Any]:
     return {
         "kind": "run",
         "state": "recording" if is_growing else "at rest",
@@ -278,7 +300,8 @@ def _run_standing(*, is_growing: bool) -> dict[str, Any]:
         if is_growing
         else "'namod-ctl reconstruct' works out the facets; 'namod-ctl instruct' writes sheets for the bolts",
         "step": 0,
-        "commands": [],
+        "commands": ["stop"] if is_listening else [],
         "refused": [],
+        "turns_of": None,
         "turns": [],
     }

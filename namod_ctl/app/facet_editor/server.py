@@ -1,12 +1,11 @@
 """The facet map editor: a page for one person on this computer.
 
-Bound to 127.0.0.1. Whatever a web site of another origin might try, it can neither read nor write: the Host header must
-be this page's own, and every POST needs the page's origin and the token that is printed at start.
+Bound to 127.0.0.1. Whatever a web site of another origin might try, it can neither read nor write: the guard that the
+live page has lets only this page itself send, with the token that is printed at start.
 """
 
 from __future__ import annotations
 
-import hmac
 import secrets
 import socket
 from collections.abc import Callable
@@ -17,13 +16,12 @@ from importlib.resources import files
 import uvicorn
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
-from starlette.datastructures import Headers, MutableHeaders
 from starlette.middleware import Middleware
 from starlette.requests import Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from namod_ctl.app.dashboard.guard import Guard, Rules
 from namod_ctl.app.facet_editor.messages import (
     Drawing,
     Marks,
@@ -37,7 +35,6 @@ from namod_ctl.app.facet_editor.workbench import Workbench, png_of
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.optics.facet_marks import MarksError
 
-TOKEN_HEADER = "x-namod-token"
 MAX_BODY_BYTES = 4_000_000
 """A map of 1000 round facets with 48 corners each is 1 MB."""
 PAGE_FILES = {
@@ -49,54 +46,10 @@ PAGE_FILES = {
     "server.js": "text/javascript; charset=utf-8",
     "icon.svg": "image/svg+xml",
 }
-HEADERS = {
-    "content-security-policy": (
-        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
-        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-    ),
-    "x-content-type-options": "nosniff",
-    "referrer-policy": "no-referrer",
-    "cross-origin-resource-policy": "same-origin",
-    "cache-control": "no-store",
-}
 
 
-class Guard:
-    """Refuses requests that are not of this page, and puts the headers that browsers obey on every answer."""
-
-    def __init__(self, app: ASGIApp, host: str, token: str) -> None:
-        self._app, self._host, self._token = app, host, token
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
-
-        async def send_guarded(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                MutableHeaders(scope=message).update(HEADERS)
-            await send(message)
-
-        refused = self._refusal(scope["method"], Headers(scope=scope))
-        app: ASGIApp = self._app if refused is None else PlainTextResponse(refused[1], refused[0])
-        await app(scope, receive, send_guarded)
-
-    def _refusal(self, method: str, headers: Headers) -> tuple[int, str] | None:
-        if headers.getlist("host") != [self._host]:
-            return 421, "this page does not go by that name; use the address that was printed at start"
-        if method in ("GET", "HEAD"):
-            return None
-        if headers.getlist("origin") != [f"http://{self._host}"]:
-            return 403, "only this page itself may send"
-        if not hmac.compare_digest(headers.get(TOKEN_HEADER, "").encode(), self._token.encode()):
-            return 401, "the token is missing or wrong; open the whole address that was printed at start"
-        if not headers.get("content-length", "").isdigit() or int(headers["content-length"]) > MAX_BODY_BYTES:
-            return 413, f"at most {MAX_BODY_BYTES} bytes"
-        return None
-
-
-def build_app(bench: Workbench, host: str, token: str) -> Starlette:
-    """The editor as an ASGI application that goes by `host` (with port)."""
+def build_app(bench: Workbench, token: str) -> Starlette:
+    """The editor as an ASGI application that takes what it is sent from its own page only, with `token`."""
     folder = files("namod_ctl.app.facet_editor")
     served = {name: (folder / name).read_bytes() for name in PAGE_FILES}
     picture = png_of(bench.image)
@@ -157,7 +110,7 @@ def build_app(bench: Workbench, host: str, token: str) -> Starlette:
             *(Route(f"/{work.__name__}", _answering(work), methods=["POST"]) for work in (solve, propose, check, save)),
             Route("/{name}", page),
         ],
-        middleware=[Middleware(Guard, host=host, token=token)],
+        middleware=[Middleware(Guard, rules=Rules(token, is_loopback=True, max_body_bytes=MAX_BODY_BYTES))],
     )
 
 
@@ -165,15 +118,24 @@ def _answering(work: Callable[[bytes], dict[str, object]]) -> Callable[[Request]
     """The request handler that lets `work` answer; what a person can mend comes back as text, status 422."""
 
     async def answer(request: Request) -> Response:
-        body = await request.body()
         try:
-            return JSONResponse(await run_in_threadpool(work, body))
+            return JSONResponse(await run_in_threadpool(work, await _body(request)))
         except MarksError as error:
             return JSONResponse({"error": str(error), "ids": list(error.facet_ids)}, 422)
         except ConfigError as error:
             return JSONResponse({"error": str(error), "ids": []}, 422)
 
     return answer
+
+
+async def _body(request: Request) -> bytes:
+    """What was sent. Raises ConfigError when it is more than its length promised, and too much."""
+    body = bytearray()
+    async for part in request.stream():
+        body += part
+        if len(body) > MAX_BODY_BYTES:
+            raise ConfigError(f"at most {MAX_BODY_BYTES} bytes can be sent")
+    return bytes(body)
 
 
 def serve(bench: Workbench, port: int, announce: Callable[[str], None]) -> None:
@@ -186,7 +148,7 @@ def serve(bench: Workbench, port: int, announce: Callable[[str], None]) -> None:
     token = secrets.token_urlsafe(24)
     server = uvicorn.Server(
         uvicorn.Config(
-            build_app(bench, host, token),
+            build_app(bench, token),
             ws="none",
             lifespan="off",
             log_level="error",

@@ -182,9 +182,13 @@ def open_workbench(config: str, image: Path, image_pixels: Image, out: Path | No
     ConfigError
         The config is wrong, or the picture has another aspect ratio than the reflector camera.
     """
-    instrument = build_instrument(load_config(config))
-    camera = scaled_camera(instrument.reflector_camera, image_pixels.shape[1], image_pixels.shape[0])
     own = _map_file(config)
+    # a config may name the file that is about to be made
+    instrument = build_instrument(load_config(config, has_map=own is None or own.is_file()))
+    try:
+        camera = scaled_camera(instrument.reflector_camera, image_pixels.shape[1], image_pixels.shape[0])
+    except ConfigError as problem:
+        raise ConfigError(f"{image}: {problem}") from None
     return Workbench(instrument, camera, image_pixels, image.name, out if out is not None else own, own)
 
 

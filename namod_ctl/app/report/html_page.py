@@ -1,4 +1,7 @@
-"""A report as one HTML file: no script, nothing from elsewhere; black on white by day and on paper, red by night."""
+"""A report as one HTML file: no script, nothing from elsewhere; black on white by day and on paper, red by night.
+
+Night comes by itself where the browser is set to dark, and by a tick elsewhere, which needs no script either.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,11 @@ from itertools import count
 
 from namod_ctl.app.report.document import Block, Document, Listing, Picture, Table, Text
 
+_NIGHT = """
+  ROOT { --ink: #ff5040; --paper: #000; --line: #7a1a10; --soft: #1c0502; --strong: #ff8070; color-scheme: dark }
+  ROOT .picture { background: var(--ink); isolation: isolate }  /* white of the inverted picture shines through */
+  ROOT .picture img { filter: grayscale(1) invert(1) brightness(.65); mix-blend-mode: multiply }
+"""
 _STYLE = """
 :root { color-scheme: light dark; --ink: #111; --paper: #fff; --line: #999; --soft: #eee; --strong: #9c3000 }
 * { box-sizing: border-box }
@@ -25,26 +33,27 @@ th, td { border-bottom: 1px solid var(--line); padding: .2rem .6rem; text-align:
 thead th { border-bottom: 2px solid var(--ink); vertical-align: bottom; white-space: normal }
 .words { text-align: left; white-space: normal; overflow-wrap: anywhere; min-width: 13rem }
 tbody th, thead th:first-child { text-align: left }
-tbody th { font-weight: 600; white-space: normal; overflow-wrap: anywhere; min-width: 3.5rem }
+tbody th { font-weight: 600; white-space: normal; overflow-wrap: break-word; min-width: 3.5rem }
 figure { margin: 1rem 0 }
 .picture { display: inline-block; max-width: 100% }
 img { max-width: 100%; height: auto; display: block }
 pre { background: var(--soft); padding: .8rem; overflow-x: auto; white-space: pre-wrap; overflow-wrap: anywhere }
 .warning { border-left: .4rem solid var(--strong); padding-left: .8rem; font-weight: 700; color: var(--strong) }
+#night { accent-color: #ff5040 }  /* its tick is black then */
 @media screen and (prefers-color-scheme: dark) {
-  :root { --ink: #ff5040; --paper: #000; --line: #7a1a10; --soft: #1c0502; --strong: #ff8070 }
-  .picture { background: var(--ink); isolation: isolate }  /* what is white on the inverted picture shines through */
-  .picture img { filter: grayscale(1) invert(1) brightness(.65); mix-blend-mode: multiply }
-}
+  .night { display: none }  /* it is night already, from the first moment on */NIGHT_WHERE_DARK}
+@media screen {NIGHT_WHERE_CHECKED}
 @media print {
   body { max-width: none; padding: 0; font-size: 9pt }
-  nav { display: none }
+  nav, .night { display: none }
   .wide { overflow: visible }
   tr, figure { break-inside: avoid }
   h2 { break-after: avoid }
   thead { display: table-header-group }
 }
 """
+_STYLE = _STYLE.replace("NIGHT_WHERE_DARK", _NIGHT.replace("ROOT", ":root"))
+_STYLE = _STYLE.replace("NIGHT_WHERE_CHECKED", _NIGHT.replace("ROOT", ":root:has(#night:checked)"))
 
 
 def to_html(document: Document) -> bytes:
@@ -57,7 +66,8 @@ def to_html(document: Document) -> bytes:
         '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; img-src data:; '
         "style-src 'unsafe-inline'\">",
         f"<title>{escape(document.title)}</title><style>{_STYLE}</style></head><body>",
-        f"<header><h1>{escape(document.title)}</h1><p>{escape(document.subtitle)}</p></header>",
+        f"<header><h1>{escape(document.title)}</h1><p>{escape(document.subtitle)}</p>",
+        '<p class="night"><label><input type="checkbox" id="night"> Night: red on black</label></p></header>',
         '<nav aria-label="Contents"><ul>',
         *(f'<li><a href="#c{n}">{escape(chapter.title)}</a></li>' for n, chapter in enumerate(document.chapters)),
         "</ul></nav><main>",

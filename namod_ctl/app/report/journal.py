@@ -34,11 +34,16 @@ _OUTCOMES = {
 
 
 def journal_chapter(events: Sequence[Event]) -> Chapter:
-    """Everything that happened, in its order; what was left alone for the same reason in one line."""
-    rows = [(when_text(event.time_utc), *_words(event)) for event in _grouped(events)]
+    """Everything that happened, in its order."""
+    rows = journal_rows(events)
     if not rows:
         return Chapter("What happened", (Text("Nothing yet."),))
-    return Chapter("What happened", (Table(("when", "what", "why"), tuple(rows), frozenset({1, 2})),))
+    return Chapter("What happened", (Table(("when", "what", "why"), rows, frozenset({1, 2})),))
+
+
+def journal_rows(events: Sequence[Event]) -> tuple[tuple[str, str, str], ...]:
+    """When, what and why, event by event; what was left alone for the same reason in one row."""
+    return tuple((when_text(event.time_utc), *_words(event)) for event in _grouped(events))
 
 
 def fault_chapter(store: CampaignStore) -> Chapter:
@@ -50,8 +55,7 @@ def fault_chapter(store: CampaignStore) -> Chapter:
     ]
     blocks: list[Block] = []
     if troubles:
-        rows = tuple((when_text(event.time_utc), *_words(event)) for event in _grouped(troubles))
-        blocks.append(Table(("when", "what", "why"), rows, frozenset({1, 2})))
+        blocks.append(Table(("when", "what", "why"), journal_rows(troubles), frozenset({1, 2})))
     legs = [
         order for order in store.orders() if order.result is None or order.result.outcome is not MoveOutcome.ARRIVED
     ]

@@ -15,6 +15,7 @@ from namod_ctl.optics.instrument import Instrument
 from namod_ctl.reconstruction.alignment import Alignment
 from namod_ctl.store.campaign import CampaignStore
 from namod_ctl.store.campaign_rows import AskedTurns, JournaledOrder
+from namod_ctl.twin.operator import GONIOMETER_ERROR_RAD
 
 
 def motion_chapters(store: CampaignStore, instrument: Instrument, alignments: Mapping[int, Alignment]) -> list[Chapter]:
@@ -96,8 +97,7 @@ def _checked(
         for n in (number, number + 1)
     )
     asked = {turn.facet_id: np.array(turn.turns_deg) for turn in turns if turn.is_done}
-    # a person reads a goniometer to about half of what it resolves
-    findings = check_turns(instrument.mounts, asked, was, is_now, 0.5 * instrument.goniometer_resolution_rad)
+    findings = check_turns(instrument.mounts, asked, was, is_now, GONIOMETER_ERROR_RAD)  # as the campaign itself did
     return {
         finding.facet_id: finding.sentence if finding.kind.is_mistake else finding.kind.value.replace("_", " ")
         for finding in findings

@@ -61,7 +61,7 @@ def running_editor(folder: Path) -> Iterator[Editor]:
     listener = socket.create_server(("127.0.0.1", 0))
     host = f"127.0.0.1:{listener.getsockname()[1]}"
     bench = open_workbench(CONFIG, picture, read_picture(picture), out)
-    app = build_app(bench, host, TOKEN)
+    app = build_app(bench, TOKEN)
     server = uvicorn.Server(uvicorn.Config(app, ws="none", lifespan="off", log_level="error", access_log=False))
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
     thread.start()

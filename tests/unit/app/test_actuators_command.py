@@ -36,11 +36,21 @@ def test_names_that_are_none_are_refused(name: str, words: str) -> None:
         legs_named([name], LEGS)
 
 
-def test_the_list_has_every_drive() -> None:
-    result = called("list", "--twin")
+@pytest.mark.parametrize("config", ["fact_actuated", "fact_zaber", "mst_actuated"])
+def test_the_list_has_every_drive_in_a_line_of_80_columns(config: str) -> None:
+    result = CliRunner().invoke(app, ["actuators", "list", "--twin", "--config", config], env={"COLUMNS": "80"})
     assert result.exit_code == 0
-    assert "90 of 90 drives are ready to move" in result.output
-    assert "TMCM-6110" in result.output
+    drives = [line for line in result.output.splitlines() if line[0].isdigit() and "stands" in line]
+    assert f"{len(drives)} of {len(drives)} drives ready to move" in result.output
+    assert len(drives) == len({line.split()[0] for line in drives}) == (172 if config == "mst_actuated" else 90)
+    assert max(map(len, drives)) <= 80
+    assert all("twin/" in line for line in drives)
+
+
+def test_the_list_says_once_what_all_drives_are() -> None:
+    result = called("list", "--twin")
+    assert result.output.count("TMCM-6110") == 1
+    assert "facets 0, 2 to 7, 10 to 13, 15 to 19, 21 to 27, 29 to 35 legs 1 to 3" in result.output
 
 
 def test_a_jog_asks_first_and_moves_by_what_was_said() -> None:
@@ -52,6 +62,14 @@ def test_a_jog_asks_first_and_moves_by_what_was_said() -> None:
 def test_without_a_yes_nothing_moves() -> None:
     result = called("move", "13", "--to-mm", "0.3", "--twin", answer="n\n")
     assert result.exit_code == 1
+    assert "arrived" not in result.output
+
+
+@pytest.mark.parametrize("arguments", [("jog", "13.2", "--by-mm", "0.1"), ("home", "13"), ("selftest", "13")])
+def test_where_nobody_can_answer_it_is_told_what_to_write(arguments: tuple[str, ...]) -> None:
+    result = called(*arguments, "--twin", answer="")
+    assert isinstance(result.exception, ConfigError)
+    assert "--yes" in str(result.exception)
     assert "arrived" not in result.output
 
 
@@ -68,7 +86,7 @@ def test_home_stop_and_selftest() -> None:
     assert (stop.exit_code, stop.output.count("stands at")) == (0, 90)
     selftest = called("selftest", "13.1", "--twin", "--yes")
     assert selftest.exit_code == 0
-    assert "1 of 1 legs passed" in selftest.output
+    assert "1 of 1 leg passed" in selftest.output
     assert "44" in selftest.output  # of its bus, watched
 
 

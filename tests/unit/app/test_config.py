@@ -77,9 +77,9 @@ def test_a_missing_section_is_refused(section: str, refuse: Refuse) -> None:
     ("line", "new", "says"),
     [
         # wrong unit
-        ("focal_length_m", "focal_length_m = 4889.0", r"telescope\.focal_length_m: 4889\.0 .* at most 100 m: .*unit"),
-        ("focal_length_m", "focal_length_m = 488.9", "focal_length_m: 488.9"),
-        ("radius_m", "radius_m = 295.0", "mount.radius_m: 295.0"),
+        ("focal_length_m", "focal_length_m = 4889.0", r"telescope\.focal_length_m = 4889\.0 .* at most 100 m; .*unit"),
+        ("focal_length_m", "focal_length_m = 488.9", "focal_length_m = 488.9"),
+        ("radius_m", "radius_m = 295.0", "mount.radius_m = 295.0"),
         ("pitch_mm", "pitch_mm_per_turn = 0.001", "at least 0.05 mm per turn"),
         ("travel_limit_mm", "travel_limit_mm = 0.005", "mount.travel_limit_mm"),
         (
@@ -92,8 +92,8 @@ def test_a_missing_section_is_refused(section: str, refuse: Refuse) -> None:
         ("star_diameter_deg", "star_diameter_deg = 25.0", "star_diameter_deg"),
         ("saturation_share", "saturation_share = 98", "saturation_share"),
         # wrong sign
-        ("focal_length_m", "focal_length_m = -4.889", "at least 0.1 m: check sign and unit"),
-        ("r_expo = -1.23", "r_expo = 1.23", "radiometric_law.r_expo: 1.23"),
+        ("focal_length_m", "focal_length_m = -4.889", "at least 0.1 m; check sign and unit"),
+        ("r_expo = -1.23", "r_expo = 1.23", "radiometric_law.r_expo = 1.23"),
         ("backlash_um", "backlash_um = -1.0", "at least 0 um"),
         ("columns = 2560", "columns = -2560", "star_camera.columns"),
         # wrong type
@@ -102,7 +102,7 @@ def test_a_missing_section_is_refused(section: str, refuse: Refuse) -> None:
         ("columns = 2560", "columns = 2560.5", "star_camera.columns"),
         ("radius_m", "radius_m = nan", "no finite number"),
         ("radius_m", "radius_m = inf", "mount.radius_m"),
-        ("radius_m", f"radius_m = {10**400}", r"mount\.radius_m: 10{56}\.\.\."),
+        ("radius_m", f"radius_m = {10**400}", r"mount\.radius_m = 10{56}\.\.\."),
         ("radius_m", f"radius_m = 1{'0' * 5000}", "not valid TOML"),
         ("radius_m", f"radius_m = {'[' * 5000}", "not valid TOML"),
         ("turn_raises_leg", 'turn_raises_leg = "left"', "'clockwise' or 'counterclockwise'"),
@@ -153,7 +153,7 @@ def test_broken_toml_names_line_and_column(refuse: Refuse) -> None:
 
 def test_a_missing_config_lists_the_builtin_names(tmp_path: Path) -> None:
     for wrong in (tmp_path / "no.toml", tmp_path, "nosuch"):
-        with pytest.raises(ConfigError, match=r"built-in name: fact, .*mst_like"):
+        with pytest.raises(ConfigError, match=r"built-in name: .*fact, .*mst_like"):
             load_config(wrong)
 
 
@@ -181,7 +181,7 @@ def _inline_facet(**changes: str) -> str:
         (_inline_facet(position_m="[0.5, 0.0]"), r"reflector\.facets\[1\]\.position_m"),
         (_inline_facet(position_m="[0.5, 0.0, 9e9]"), r"reflector\.facets\[1\]\.position_m\[3\]"),
         (_inline_facet(focal_length_m="16.0"), "facet 7 has focal_length_m = 16.* no radius of curvature"),
-        (_inline_facet(width_m="60.6"), r"reflector\.facets\[1\]\.width_m: 60.6"),
+        (_inline_facet(width_m="60.6"), r"reflector\.facets\[1\]\.width_m = 60.6"),
         (_inline_facet(width_cm="60.6"), r"reflector\.facets\[1\]\.width_cm: is in cm"),
         (_inline_facet(shape='"octagon"'), "'hexagon', 'square' or 'round'"),
         (_inline_facet() + _inline_facet(), "facet id 7 occurs 2 times"),
@@ -231,7 +231,7 @@ def test_facets_come_from_a_sim_telarray_list_and_stand_on_the_dish(tmp_path: Pa
 def test_a_bad_row_of_a_facet_list_is_named_by_its_own_file(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"list\.txt, line 2: column 8 \(type\) holds 'Oct'"):
         _load_with_list(tmp_path, 'format = "mars"', MARS_ROWS[::-1].replace("xeH", "tcO", 1)[::-1])
-    with pytest.raises(ConfigError, match=r"list\.txt: facet 1: position_m\[3\]: -20\.0 is not plausible"):
+    with pytest.raises(ConfigError, match=r"list\.txt: facet 1: position_m\[3\] = -20\.0 is not plausible"):
         _load_with_list(tmp_path, 'format = "mars"', MARS_ROWS.replace("25.88", "-2000.0"))
 
 
@@ -250,7 +250,7 @@ def test_a_flood_of_problems_is_cut_short(refuse: Refuse) -> None:
         ("[[10, 10], [20, 20], [2000, 10]]", "facet 13: corner 3 at .* outside the image of 1024 x 768"),
         ("[[10, 10], [20, 20], [20, 768]]", "facet 13: corner 3"),
         ("[[10, 10], [20, 20]]", "facet 13: has 2 corners"),
-        ("[[10, 10], [20, 20], [nan, 10]]", r"reflector_map\.polygons\[1\]\.corners_px\[3\]\[1\]: nan is no finite"),
+        ("[[10, 10], [20, 20], [nan, 10]]", r"reflector_map\.polygons\[1\]\.corners_px\[3\]\[1\] = nan is no finite"),
     ],
 )
 def test_bad_outlines_are_refused(corners: str, says: str, refuse: Refuse) -> None:
@@ -264,7 +264,7 @@ def test_outlines_of_unknown_or_repeated_facets_are_refused(refuse: Refuse) -> N
     polygon = "{facet_id = %d, corners_px = [[10, 10], [20, 20], [20, 10]]}"
     start = FACT_TOML.replace('polygons_file = "fact_polygons.csv"', "polygons = [")
     message = refuse(start + polygon % 1 + ", " + polygon % 13 + ", " + polygon % 13 + "]")
-    assert "the polygon of facet 1: the reflector has no facet of this id; its ids are 0, 2, 3" in message
+    assert "the polygon of facet 1: the reflector has no facet of this id; its ids are 0, 2 to 7" in message
     assert "the polygon of facet 13 occurs twice" in message
 
 
@@ -287,7 +287,7 @@ def _with_mount(body: str) -> str:
     [
         ("[[0.3, 0.0], [-0.3, 0.0]]", "true", "", "on one line"),
         ("[[0.3, 0.0], [0.0, 0.3]]", "false", "", "2 straight legs without a fixed point"),
-        ("[[300.0, 0.0], [0.0, 300.0]]", "true", "", r"mount\.positions_m\[1\]\[1\]: 300.0 .* at most 2 m"),
+        ("[[300.0, 0.0], [0.0, 300.0]]", "true", "", r"mount\.positions_m\[1\]\[1\] = 300.0 .* at most 2 m"),
         ("[[0.3, 0.0], [0.0, 0.3]]", "true", "pitch_mm_per_turn = 1.0", "go together"),
         ("[[0.3, 0.0], [0.0, 0.3]]", "true", "base_joints_m = [[0.0, 0.0, -0.2]]", "1 joints for 2 positions_m"),
     ],

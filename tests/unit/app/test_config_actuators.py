@@ -185,9 +185,9 @@ def test_without_a_key_it_is_refused_or_has_its_default(key: str, tmp_path: Path
         (
             "range_mm = [-4.0, 5.0]",
             "range_mm = [5.0, -4.0]",
-            "actuators.range_mm: [5, -4] is inside out: the first must be below",
+            "actuators.range_mm = [5, -4] is inside out: the first must be below",
         ),
-        ("range_mm = [-4.0, 5.0]", "range_mm = [1.0, 1.0]", "actuators.range_mm: [1, 1] is inside out"),
+        ("range_mm = [-4.0, 5.0]", "range_mm = [1.0, 1.0]", "actuators.range_mm = [1, 1] is inside out"),
         ("range_mm = [-4.0, 5.0]", "range_mm = [-4000.0, 5.0]", "-4000.0 is not plausible, must be at least -200 mm"),
         (
             "range_mm = [-4.0, 5.0]",
@@ -199,12 +199,12 @@ def test_without_a_key_it_is_refused_or_has_its_default(key: str, tmp_path: Path
             "step_mm = 0.003",
             "actuators.step_mm: is in mm (value 0.003), but this value is expected in um",
         ),
-        ("step_um = 3.0", "step_um = 0.0", "actuators.step_um: 0.0 is not plausible, must be at least 0.0001 um"),
-        ("sign = -1", "sign = 0", "actuators.sign: 0 does not fit"),
+        ("step_um = 3.0", "step_um = 0.0", "actuators.step_um = 0.0 is not plausible, must be at least 0.0001 um"),
+        ("sign = -1", "sign = 0", "actuators.sign = 0 does not fit"),
         ("poll_s = 0.1", "polls_s = 0.1", "actuators.motion.polls_s: unknown key (value 0.1); did you mean poll_s?"),
         ("retries = 2", "n_retries = 2", "actuators.buses[1].n_retries: unknown key"),
-        ("baud = 57600", "baud = 57600.5", "actuators.buses[1].baud: 57600.5 does not fit"),
-        ('"tmcl"', '"canopen"', "actuators.buses[1].protocol: 'canopen' does not fit"),
+        ("baud = 57600", "baud = 57600.5", "actuators.buses[1].baud = 57600.5 does not fit"),
+        ('"tmcl"', '"canopen"', "actuators.buses[1].protocol = 'canopen' does not fit"),
         ('"/dev/ttyUSB7"', '"http://host"', "'http://host' names no line; write one of /dev/ttyUSB0, COM3, socket://"),
         ('"/dev/ttyUSB7"', '"socket://host"', "'socket://host' names no line"),
         ('"/dev/ttyUSB7"', '"rfc2217://host:99999"', "'rfc2217://host:99999' names no line"),
@@ -259,7 +259,7 @@ def test_without_a_key_it_is_refused_or_has_its_default(key: str, tmp_path: Path
             'name = "east"',
             "buses[2].name = 'east' is also that of actuators.buses[1]; every bus needs its own",
         ),
-        ('name = "west"', 'name = "../west"', "actuators.buses[2].name: '../west' does not fit"),
+        ('name = "west"', 'name = "../west"', "actuators.buses[2].name = '../west' does not fit"),
         (
             "max_travel_per_cycle_mm = 3.0",
             "max_travel_per_cycle_mm = 6.0",
@@ -274,7 +274,7 @@ def test_without_a_key_it_is_refused_or_has_its_default(key: str, tmp_path: Path
         (
             '"pulse_stepper"',
             '"two_register"\nbaud = 1',
-            "actuators.buses[2].baud: 1 is not plausible, must be at least 300",
+            "actuators.buses[2].baud = 1 is not plausible, must be at least 300",
         ),
     ],
 )
@@ -389,9 +389,9 @@ def test_config_check_tells_the_drives_and_warns(
         "9 on 2 buses, for 3 of 30 facets",
         "moves a leg away from the sky",
         "-4 to 5 mm from the reference",
-        "TMCL on loopback://a at 57600 baud: 6 drives, addresses 5 to 40, axes 0 to 4; at most 6 move at once",
+        "TMCL on loopback://a at 57600 baud: 6 drives, addresses 5, 6, 40, axes 0 to 2, 4; at most 6 at once",
         "Modbus TCP (pulse-count stepper drive) on socket://192.0.2.7:502: 3 drives, addresses 1 to 3;",
-        "warning: facets without drives, which stay as they are: 0, 2, 3",
+        "warning: facets without drives, which stay as they are: 0, 2 to 7",
         "warning: legs have a play of 10 um and are not approached from one side",
         "warning: buses in memory, for the twin only (loopback://): east",
     ):

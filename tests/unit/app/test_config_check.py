@@ -93,3 +93,48 @@ def test_a_bad_config_is_a_message_and_exit_code_2(
     assert out == ""
     assert "bad.toml" in err
     assert "Traceback" not in err
+
+
+def test_all_problems_are_told_at_once_each_in_the_same_form(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of values, of files and between sections; a section that is wrong hides none of the others."""
+    (tmp_path / "facets.csv").write_text((builtin_folder() / "fact_facets.csv").read_text())
+    text = (builtin_folder() / "fact.toml").read_text()
+    for old, new in (
+        ("radius_m = 0.295", "radius_m = 295.0"),
+        ('"fact_facets.csv"', '"facets.csv"'),
+        ('"fact_polygons.csv"', '"absent.csv"'),
+        ("[telescope]", "[recording]\nbrightest_pixel_share = 0.93\n\n[telescope]"),
+        ("saturation_share = 0.98", "saturation_share = 0.92"),
+    ):
+        assert old in text, old
+        text = text.replace(old, new)
+    path = tmp_path / "it.toml"
+    path.write_text(text)
+    code, _, err = _run(monkeypatch, capsys, "config", "check", str(path))
+    assert code == 2
+    head, *problems = err.splitlines()
+    assert head == f"namod-ctl: {path}: these are its problems:"
+    for beginning in (
+        "mount.radius_m = 295.0 is not plausible",
+        f"{tmp_path / 'absent.csv'}: there is no such file",
+        "recording.brightest_pixel_share = 0.93 must be less than star_camera.saturation_share",
+        "recording.brightest_pixel_share = 0.93 must be less than reflector_camera.saturation_share",
+    ):
+        assert [problem for problem in problems if problem.startswith(f"  {beginning}")], (beginning, err)
+    assert len(problems) == 4
+
+
+def test_an_entry_with_a_problem_is_not_also_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (
+        (builtin_folder() / "fact.toml").read_text().replace('facets_file = "fact_facets.csv"\nformat = "namod"\n', "")
+    )
+    facet = 'id = 1\nposition_m = [0.0, 0.0, 0.0]\nfocal_length_m = 4.9\nshape = "hexagon"\nwidth_m = 60.6\n'
+    path = tmp_path / "it.toml"
+    path.write_text(text.split("[reflector_map]")[0] + f"\n[[reflector.facets]]\n{facet}")
+    _, _, err = _run(monkeypatch, capsys, "config", "check", str(path))
+    assert "reflector.facets[1].width_m = 60.6" in err
+    assert len(err.splitlines()) == 1

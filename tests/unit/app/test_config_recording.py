@@ -43,11 +43,11 @@ def test_what_is_set_is_used_and_stored(tmp_path: Path) -> None:
     [
         (
             "brightest_pixel_share = 80.0",
-            "recording.brightest_pixel_share: 80.0 is not plausible, must be at most 0.95",
+            "recording.brightest_pixel_share = 80.0 is not plausible, must be at most 0.95",
         ),
-        ("brightest_pixel_share = 0.1", "recording.brightest_pixel_share: 0.1 is not plausible, must be at least 0.3"),
-        ("max_motion_share = -1.0", "recording.max_motion_share: -1.0 is not plausible, must be at least 0.05"),
-        ("longest_exposure_s = 3000.0", "recording.longest_exposure_s: 3000.0 is not plausible, must be at most 600"),
+        ("brightest_pixel_share = 0.1", "recording.brightest_pixel_share = 0.1 is not plausible, must be at least 0.3"),
+        ("max_motion_share = -1.0", "recording.max_motion_share = -1.0 is not plausible, must be at least 0.05"),
+        ("longest_exposure_s = 3000.0", "recording.longest_exposure_s = 3000.0 is not plausible, must be at most 600"),
         ("longest_exposure_ms = 3000.0", "convert it and write longest_exposure_s"),
         ("shortest_exposure_s = 5.0", "shortest_exposure_s = 5 is more than longest_exposure_s = 3"),
         ("zero_point = 5.0", "recording.zero_point: unknown key"),

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from dashboard_samples import new_run
 
 from namod_ctl.app.cli import main
 from namod_ctl.app.commands import control
@@ -20,7 +21,8 @@ from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.drives import Leg
 from namod_ctl.core.motion import MoveOrder, MoveOutcome, MoveResult
 from namod_ctl.core.units import arcmin2_to_rad2
-from namod_ctl.cycle.control import ControlBox, Request, RequestKind
+from namod_ctl.cycle.control import OF_FACETS, ControlBox, Request, RequestKind
+from namod_ctl.cycle.recording_control import RecordingControl
 from namod_ctl.store.campaign import CampaignStore
 from namod_ctl.store.campaign_rows import Cycle
 
@@ -105,7 +107,7 @@ def set_state(path: Path, state: str) -> None:
         store.add_transition("checking", state, "test", f"to be {state}")
 
 
-@pytest.mark.parametrize("kind", [kind for kind in RequestKind if kind is not RequestKind.DONE])
+@pytest.mark.parametrize("kind", [kind for kind in RequestKind if kind not in OF_FACETS])
 def test_requests_reach_who_is_at_work(namod_ctl: Call, campaign: Path, kind: RequestKind) -> None:
     with at_work(campaign, say_ok) as taken:
         result = namod_ctl(kind.value, campaign)
@@ -161,16 +163,66 @@ def test_done_goes_to_who_is_at_work(namod_ctl: Call, campaign: Path) -> None:
 
 def test_done_without_anybody(namod_ctl: Call, campaign: Path) -> None:
     result = namod_ctl("done", campaign, "--facet", "31")
-    assert (result.code, result.out) == (0, "Done: facet 31. Still to be done: facet 13.\n")
+    assert (result.code, result.out) == (0, "1 facet marked as done: 31; 1 to go: 13\n")
     result = namod_ctl("done", campaign, "--facet", "13,77")
     assert result.code == 2
     assert "of facet 77" in result.err
     result = namod_ctl("done", campaign, "--all")
     assert result.code == 0
-    assert "Done: facet 13. Still to be done: none." in result.out
+    assert "1 facet marked as done: 13; all are done" in result.out
     assert f"align --resume {campaign}" in result.out
     with CampaignStore.open(campaign) as store:
         assert [event.data["facet_ids"] for event in store.events() if event.kind == "done"] == [[31], [13]]
+
+
+def test_marks_are_taken_back_without_anybody_until_the_campaign_has_gone_on(namod_ctl: Call, campaign: Path) -> None:
+    set_state(campaign, "awaiting_operator")
+    namod_ctl("done", campaign, "--all")
+    result = namod_ctl("done", campaign, "--undo", "--facet", "13")
+    assert (result.code, result.out) == (0, "1 facet not done after all: 13; 1 to go: 13\n")
+    assert "of facet 77" in namod_ctl("done", campaign, "--undo", "--facet", "77").err
+    with CampaignStore.open(campaign) as store:
+        assert [event.data["facet_ids"] for event in store.events() if event.kind == "not_done"] == [[13]]
+        assert [turns.is_done for turns in store.turns()] == [False, True]
+    set_state(campaign, "recording")
+    result = namod_ctl("done", campaign, "--undo", "--facet", "31")
+    assert result.code == 2
+    assert "has gone on" in result.err
+
+
+def test_undo_goes_to_who_is_at_work(namod_ctl: Call, campaign: Path) -> None:
+    with at_work(campaign, say_ok) as taken:
+        assert namod_ctl("done", campaign, "--undo", "--facet", "31").code == 0
+    assert [(request.kind, request.facet_ids) for request in taken] == [(RequestKind.NOT_DONE, (31,))]
+
+
+def test_a_recording_is_stopped_by_its_folder(namod_ctl: Call, tmp_path: Path) -> None:
+    with new_run(tmp_path / "RUN"):
+        pass
+    result = namod_ctl("stop", tmp_path / "RUN")
+    assert result.code == 2
+    assert "nobody records" in result.err
+    is_asked, is_over = threading.Event(), threading.Event()
+
+    def record() -> None:
+        with RecordingControl(tmp_path / "RUN", is_asked.set) as box:
+            is_ready.set()
+            while not is_over.wait(0.005):
+                box.look()
+
+    is_ready = threading.Event()
+    recorder = threading.Thread(target=record)
+    recorder.start()
+    try:
+        assert is_ready.wait(10.0)
+        result = namod_ctl("stop", tmp_path / "RUN")
+    finally:
+        is_over.set()
+        recorder.join(10.0)
+    assert result.code == 0
+    assert "stopping" in result.out
+    assert is_asked.is_set()
+    assert not (tmp_path / "RUN" / "control").exists()
 
 
 @pytest.mark.parametrize("arguments", [[], ["--facet", "13", "--all"], ["--facet", "13;31"], ["--facet", ""]])
@@ -230,7 +282,7 @@ def test_status_for_a_person(namod_ctl: Call, campaign: Path) -> None:
         "Refused: facet 44: its drive reports a fault",
         "facet 13 leg 2: lost; no answer",
         "0 of 2 facets done; to do: 13, 31",
-        "transition: checking -> correcting",
+        "correcting: to be correcting",
     ):
         assert words in text
     set_state(campaign, "held")

@@ -27,8 +27,10 @@ from namod_ctl.app.dashboard.feed import Feed
 from namod_ctl.app.dashboard.guard import Rules
 from namod_ctl.app.dashboard.server import build_server, listen
 from namod_ctl.app.dashboard.state import Watched
+from namod_ctl.core.drives import DriveState, Leg
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.flags import RejectReason
+from namod_ctl.core.motion import MoveOrder, MoveOutcome, MoveResult
 
 
 def sections(text: str) -> dict[str, Any]:
@@ -259,3 +261,32 @@ def test_address_in_use_is_said(tmp_path: Path) -> None:
         listen("127.0.0.1", first.getsockname()[1])
     with pytest.raises(ConfigError, match="--host"):
         listen("192.0.2.1", 0)  # an address of the documentation, nobody's own
+
+
+def test_legs_show_their_last_order_and_what_their_drive_said_last(tmp_path: Path) -> None:
+    legs = [Leg(7, index) for index in range(4)]
+    with new_campaign(tmp_path / "C") as store, Watched(store.path) as watched:
+        assert json.loads(watched.look()["actuators"])["legs"] == []
+        store.show_legs({legs[3]: DriveState(2e-3, False, False)})
+        found = json.loads(watched.look()["actuators"])
+        assert (found["cycle"], found["counts"], found["drives"]) == (None, {}, {"not homed": 1})
+        orders = [MoveOrder(leg, 0.0, 1e-3) for leg in legs[:3]]
+        ids = store.order(store.begin_cycle(), orders)
+        store.show_legs(
+            {
+                legs[0]: DriveState(0.4e-3, True, True, (), 300.15),
+                legs[1]: DriveState(math.nan, False, True, ("supply too low",)),
+                legs[2]: "no answer from module 5",
+            }
+        )
+        by_leg = {leg["leg"]: leg for leg in json.loads(watched.look()["actuators"])["legs"]}
+        assert (by_leg[1]["position_mm"], by_leg[1]["target_mm"], by_leg[1]["drive"]) == (0.4, 1.0, "moves, 27 °C")
+        assert by_leg[2]["position_mm"] is None
+        assert "supply too low" in by_leg[2]["drive"]
+        assert "no answer from module 5" in by_leg[3]["drive"]
+        assert by_leg[4]["drive"] == "stands still, not homed"
+        store.result(ids[0], MoveResult(orders[0], MoveOutcome.ARRIVED, 1e-3))
+        store.show_legs({legs[0]: DriveState(1e-3, False, True)})
+        found = json.loads(watched.look()["actuators"])
+    assert [leg["is_bad"] for leg in found["legs"]] == [False, True, True, True]
+    assert found["drives"] == {"well and still": 1, "with a fault": 1, "silent": 1, "not homed": 1}

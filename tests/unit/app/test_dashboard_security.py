@@ -17,6 +17,7 @@ from namod_ctl.app.dashboard.feed import Feed
 from namod_ctl.app.dashboard.guard import MAX_BODY_BYTES, Rules, is_own_host
 from namod_ctl.app.dashboard.server import build_app, page_files
 from namod_ctl.cycle.control import ControlBox, Request, RequestKind
+from namod_ctl.cycle.recording_control import RecordingControl
 from namod_ctl.store.campaign import CampaignStore
 
 HOST = "127.0.0.1:8765"
@@ -94,12 +95,17 @@ def test_command_with_the_token_reaches_the_campaign(campaign: CampaignStore) ->
     with served(campaign.path) as client, Worker(campaign) as worker:
         answer = client.post("/command", content=STOP, headers=GOOD)
         refused = client.post("/command", content=json.dumps({"kind": "refuse"}), headers=GOOD)
-        done = client.post("/command", content=json.dumps({"kind": "done", "facets": [3, 7]}), headers=GOOD)
+        step = campaign.events()[-1].id
+        marks = [{"kind": kind, "facets": [3, 7], "step": step} for kind in ("done", "not_done")]
+        marked = [client.post("/command", json=mark, headers=GOOD).status_code for mark in marks]
+        stale = client.post("/command", json=marks[0] | {"step": step - 1}, headers=GOOD)
     assert (answer.status_code, answer.json()["text"]) == (200, "heard stop")
     assert refused.status_code == 409
-    assert done.status_code == 200
+    assert marked == [200, 200]
+    assert stale.status_code == 409  # the page showed another cycle's sheet
     kinds = [(request.kind, request.facet_ids) for request in worker.taken]
-    assert kinds == [(RequestKind.STOP, ()), (RequestKind.REFUSE, ()), (RequestKind.DONE, (3, 7))]
+    asked = [(RequestKind.DONE, (3, 7)), (RequestKind.NOT_DONE, (3, 7))]
+    assert kinds == [(RequestKind.STOP, ()), (RequestKind.REFUSE, ()), *asked]
 
 
 def test_approval_holds_for_the_preview_that_was_seen_and_no_other(campaign: CampaignStore) -> None:
@@ -124,9 +130,27 @@ def test_nobody_at_work_is_said(tmp_path: Path) -> None:
     assert "nobody is at work" in answer.json()["text"]
 
 
-def test_plain_run_takes_no_commands(tmp_path: Path) -> None:
+def test_plain_run_can_be_stopped_while_somebody_records_it_and_nothing_else(tmp_path: Path) -> None:
     with new_run(tmp_path / "R"), served(tmp_path / "R") as client:
-        assert client.post("/command", content=STOP, headers=GOOD).status_code == 409
+        assert client.post("/command", content=STOP, headers=GOOD).status_code == 409  # nobody records
+        is_asked, is_over = threading.Event(), threading.Event()
+        with RecordingControl(tmp_path / "R", is_asked.set) as control:
+
+            def record() -> None:
+                while not is_over.wait(0.005):
+                    control.look()
+
+            recorder = threading.Thread(target=record)
+            recorder.start()
+            try:
+                pause = client.post("/command", json={"kind": "pause"}, headers=GOOD)
+                assert (pause.status_code, is_asked.is_set()) == (409, False)
+                stop = client.post("/command", content=STOP, headers=GOOD)
+            finally:
+                is_over.set()
+                recorder.join(10.0)
+        assert (stop.status_code, is_asked.is_set()) == (200, True)
+        assert "keeps all" in stop.json()["text"]
 
 
 @pytest.mark.parametrize(
@@ -175,6 +199,9 @@ def test_oversized_body_is_refused_whether_or_not_it_says_its_size(campaign: Cam
         "/frame/99999999999999999999999999/star_camera/0",
         "/frame/0/star_camera/99999999999999999999999999",
         "/frame/-1/star_camera/0",
+        "/sheet/0",
+        "/sheet/7",
+        "/sheet/99999999999999999999999999",
         "/facet/999",
         "/facet/99999999999999999999999999",
         "/facet/1%27%20OR%201=1",

@@ -31,7 +31,12 @@ def request(editor: Editor, method: str, path: str, body: bytes | None = None, *
     """Status, headers and body; a header of None is left out."""
     usual = {"Host": editor.host}
     if method == "POST":
-        usual |= {"Origin": f"http://{editor.host}", "X-Namod-Token": TOKEN, "Content-Length": str(len(body or b""))}
+        usual |= {
+            "Origin": f"http://{editor.host}",
+            "X-Namod-Token": TOKEN,
+            "Content-Type": "application/json",
+            "Content-Length": str(len(body or b"")),
+        }
     usual |= {name.replace("_", "-"): value for name, value in headers.items()}
     connection = http.client.HTTPConnection(editor.host, timeout=30)
     connection.putrequest(method, path, skip_host=True, skip_accept_encoding=True)
@@ -146,11 +151,25 @@ def test_a_missing_facet_can_be_confirmed(editor):
         ({"Origin": "null"}, 403),
         ({"Host": "evil.example"}, 421),
         ({"Content_Length": "5000000"}, 413),
+        ({"Content_Type": "text/plain"}, 415),  # what a form of another site could send without asking
     ],
 )
 def test_strangers_write_nothing(editor, headers, status):
     editor.out.write_text("as it was")
     assert request(editor, "POST", "/save", b'{"facets": []}', **headers)[0] == status
+    assert editor.out.read_text() == "as it was"
+
+
+def test_a_body_without_a_length_is_not_read_for_ever(editor):
+    editor.out.write_text("as it was")
+    chunk = b"x" * 100_000
+    connection = http.client.HTTPConnection(editor.host, timeout=30)
+    headers = {"Origin": f"http://{editor.host}", "X-Namod-Token": TOKEN, "Content-Type": "application/json"}
+    connection.request("POST", "/save", iter([chunk] * 41), headers, encode_chunked=True)
+    answer = connection.getresponse()
+    assert answer.status == 422
+    assert b"at most 4000000 bytes" in answer.read()
+    connection.close()
     assert editor.out.read_text() == "as it was"
 
 

@@ -62,6 +62,19 @@ def test_a_config_of_ones_own_keeps_its_map(tmp_path, picture):
     assert max(np.abs(polygons[i] - outlines[i]).max() for i in outlines) < 0.6
 
 
+def test_a_config_whose_map_is_still_to_be_made(tmp_path, picture):
+    """Who begins with a telescope of their own names the file in the config, and then makes it."""
+    for name in ("fact.toml", "fact_facets.csv"):
+        (tmp_path / name).write_text((builtin_folder() / name).read_text())
+    config = tmp_path / "fact.toml"
+    with pytest.raises(ConfigError, match=r"fact_polygons\.csv: there is no such file.*facets edit"):
+        load_config(config)
+    done = run("propose", "--image", picture, "--config", config, "--marks", write_marks(tmp_path), "--no-edges")
+    assert done.exit_code == 0, done.output
+    assert "The config uses it from now on." in done.output
+    assert len(load_config(config).polygons) == 30
+
+
 def test_a_builtin_config_is_not_written_to(tmp_path, picture):
     before = (builtin_folder() / "fact_polygons.csv").read_bytes()
     done = run("propose", "--image", picture, "--marks", write_marks(tmp_path))
@@ -111,7 +124,7 @@ def test_the_editor_announces_its_address_serves_and_ends_with_ctrl_c(tmp_path, 
         connection = http.client.HTTPConnection(host, timeout=30)
         connection.request("GET", "/map")
         assert json.loads(connection.getresponse().read())["telescope"] == "FACT"
-        headers = {"Origin": f"http://{host}", "X-Namod-Token": token}
+        headers = {"Origin": f"http://{host}", "X-Namod-Token": token, "Content-Type": "application/json"}
         connection.request("POST", "/check", b'{"facets": []}', headers)
         assert len(json.loads(connection.getresponse().read())["missing"]) == 30
         connection.close()
@@ -134,3 +147,11 @@ def test_a_port_in_use_is_told(tmp_path, picture):
 def test_nothing_to_go_by_is_refused(tmp_path, picture):
     done = run("propose", "--image", picture, "--no-edges", "--out", tmp_path / "map.csv")
     assert "give --marks" in str(done.exception)
+
+
+def test_a_picture_that_is_cut_is_named(tmp_path, picture):
+    cut = tmp_path / "cut.png"
+    cv2.imwrite(str(cut), cv2.imread(str(picture))[:400])
+    done = run("propose", "--image", cut, "--out", tmp_path / "map.csv")
+    assert isinstance(done.exception, ConfigError)
+    assert str(done.exception).startswith(f"{cut}: the image has")

@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 from dataclasses import replace
+from datetime import date
 
 import numpy as np
 import pytest
@@ -30,11 +31,12 @@ from namod_ctl.app.instruction_sheets import (
     sheets_to_pdf,
     turn_in_words,
 )
-from namod_ctl.app.instructions import Verdict, facet_instructions, instructions_to_csv
+from namod_ctl.app.instructions import Verdict, facet_instructions, instructions_to_csv, settable_turn_deg
 from namod_ctl.core.flags import FacetFlag
 from namod_ctl.core.units import deg_to_rad, rad_to_deg
 
 TEN_DEG = deg_to_rad(10.0)
+WRITTEN = date(2026, 11, 22)
 
 
 def rows_of(instructions, n_bolts=3):
@@ -82,6 +84,24 @@ def test_turns_within_half_the_resolution_need_not_be_made():
     assert rows[0]["bolt_2_deg"] == "-2"
 
 
+@pytest.mark.parametrize(
+    ("turn_deg", "step_deg", "settable_deg"),
+    [(2.4, 5.0, 0.0), (-2.4, 5.0, 0.0), (2.6, 5.0, 5.0), (-123.0, 5.0, -125.0), (0.34, 0.1, 0.3), (7.0, 90.0, 0.0)],
+)
+def test_people_read_what_the_goniometer_can_show(turn_deg, step_deg, settable_deg):
+    found = settable_turn_deg(turn_deg, step_deg)
+    assert found == settable_deg
+    assert not str(found).startswith("-0.0")
+
+
+def test_the_list_for_programs_is_not_rounded_to_the_goniometer():
+    facet = facet_alignment(1, (0.1, 0.03))
+    (row,) = rows_of(facet_instructions(alignment_of([facet]), TEN_DEG))
+    listed = [int(row[f"bolt_{n}_deg"]) for n in (1, 2, 3)]
+    assert listed == [round(turn) for turn in facet.bolt_turn_deg]
+    assert any(turn % 10 for turn in listed)
+
+
 def test_hexapods_have_six_columns_and_a_telescope_without_bolts_none():
     hexapod = tripod(legs=6)
     six = rows_of(facet_instructions(alignment_of([facet_alignment(1, mount=hexapod)]), TEN_DEG), n_bolts=6)
@@ -111,7 +131,15 @@ def test_sheets_hold_every_facet_once_and_the_ladder_goes_one_way(n_facets):
 
 
 @pytest.mark.parametrize(
-    ("turn_deg", "words"), [(0, "0°"), (285, "285°"), (360, "1 turn"), (412, "1 turn + 52°"), (725, "2 turns + 5°")]
+    ("turn_deg", "words"),
+    [
+        (0, "0°"),
+        (285, "285°"),
+        (360, "1 turn"),
+        (412, "1 turn + 52°"),
+        (725, "2 turns + 5°"),
+        (722.5, "2 turns + 2.5°"),
+    ],
 )
 def test_large_turns_are_counted_in_turns(turn_deg, words):
     assert turn_in_words(turn_deg) == words
@@ -136,12 +164,15 @@ def test_sheets_say_the_sense_of_every_turn(tmp_path):
     alignment = alignment_of(facets)
     assert facets[0].bolt_turn_deg[0] > 0
     instrument = instrument_of(reflector, {})
-    text = text_of(sheets_to_pdf(instrument, facet_instructions(alignment, TEN_DEG), "headline"), tmp_path)
-    assert f"{round(facets[0].bolt_turn_deg[0])}°" in text
+    text = text_of(sheets_to_pdf(instrument, facet_instructions(alignment, TEN_DEG), "headline", WRITTEN), tmp_path)
+    turns_deg = [10 * round(abs(turn) / 10) for turn in facets[0].bolt_turn_deg]  # the goniometer's marks
+    assert [word for word in re.findall(r"(\d+)°", text) if word != "0"] == [str(turn) for turn in turns_deg]
+    assert "2026-11-22" in text
+    assert "Turned by" in text
     assert "DO NOT TURN" in text
     assert "record 17" in text
     assert "no turn needed" in text
-    pages = list(_pages(instrument, facet_instructions(alignment, TEN_DEG), "headline"))
+    pages = list(_pages(instrument, facet_instructions(alignment, TEN_DEG), "headline", WRITTEN))
     words = [t.get_text().replace("-\n", "") for page in pages for t in page.axes[0].texts]
     senses = [word for word in words if word in ("clockwise", "counterclockwise")]
     assert senses == ["clockwise", "counterclockwise", "counterclockwise"]  # bolt 1 up, bolts 2 and 3 down
@@ -152,7 +183,7 @@ def test_a_telescope_without_bolts_gets_one_page_that_says_so(tmp_path):
     driven = tripod(pitch_m=None)
     alignment = alignment_of([facet_alignment(i, mount=driven) for i in reflector.ids])
     instrument = instrument_of(reflector, {}, mount=driven)
-    text = text_of(sheets_to_pdf(instrument, facet_instructions(alignment, TEN_DEG), "headline"), tmp_path)
+    text = text_of(sheets_to_pdf(instrument, facet_instructions(alignment, TEN_DEG), "headline", WRITTEN), tmp_path)
     assert "has no bolts" in text
     assert text.count("\f") == 1
 
@@ -160,7 +191,7 @@ def test_a_telescope_without_bolts_gets_one_page_that_says_so(tmp_path):
 def test_sheets_of_a_large_telescope():
     reflector = honeycomb(198, 1.51, 28.0)
     instructions = facet_instructions(random_alignment(reflector), TEN_DEG)
-    assert sheets_to_pdf(instrument_of(reflector, {}), instructions, "headline").startswith(b"%PDF")
+    assert sheets_to_pdf(instrument_of(reflector, {}), instructions, "headline", WRITTEN).startswith(b"%PDF")
 
 
 def test_sheets_are_drawn_from_behind_unless_the_config_says_otherwise(tmp_path):
@@ -173,7 +204,9 @@ def test_sheets_are_drawn_from_behind_unless_the_config_says_otherwise(tmp_path)
     instrument = instrument_of(reflector, {})
     texts = {}
     for side in ("back", "front"):
-        texts[side] = text_of(sheets_to_pdf(replace(instrument, bolts_seen_from=side), instructions, "h"), tmp_path)
+        texts[side] = text_of(
+            sheets_to_pdf(replace(instrument, bolts_seen_from=side), instructions, "h", WRITTEN), tmp_path
+        )
     assert "BEHIND" in texts["back"]
     assert "BEHIND" not in texts["front"]
     # the numbers are the same: one sheet holds the same turns per facet, whoever looks
@@ -186,6 +219,6 @@ def test_bolts_are_where_the_person_sees_them(side):
     reflector = honeycomb(1, 0.606, 4.889)
     instrument = replace(instrument_of(reflector, {}), bolts_seen_from=side)
     instructions = facet_instructions(alignment_of([facet_alignment(1, (0.1, 0.0))]), TEN_DEG)
-    (page,) = _pages(instrument, instructions, "headline")
+    (page,) = _pages(instrument, instructions, "headline", WRITTEN)
     x_of_numbers = {t.get_text(): t.get_position()[0] for t in page.axes[0].texts if t.get_fontsize() == 9}
     assert (x_of_numbers["1"] > x_of_numbers["2"]) == (side == "front")

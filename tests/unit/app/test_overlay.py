@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -69,7 +71,8 @@ def test_the_published_geometry_with_large_turns_stays_legible():
         assert str(instruction.facet_id) in words
     assert words.count("DO NOT") == words.count("ok") == 1
     n_turned = len(facets) - 2
-    assert sum(word.endswith("°") for word in words) == 3 * n_turned
+    assert sum(word.endswith("°") for word in words) + words.count("leave") == 3 * n_turned
+    assert {int(word[1:-1]) % 10 for word in words if word.endswith("°")} == {0}  # as the goniometer can be set
     assert min(text.get_fontsize() for word, _, text in texts if word.endswith("°")) > 18  # pixels
 
 
@@ -78,7 +81,7 @@ def test_every_turn_lies_in_its_facet_beside_its_own_arm():
     instrument = published_fact()
     rng = np.random.default_rng(6)
     facets = [facet_alignment(i, rng.normal(0, 0.1, 2)) for i in instrument.reflector.ids]
-    instructions = facet_instructions(alignment_of(facets), deg_to_rad(0.1))
+    instructions = facet_instructions(alignment_of(facets), deg_to_rad(1.0))
     figure = draw_instructions(instrument, instructions, np.zeros((911, 1215, 3), np.uint8), "headline")
     zoom = 2
     texts = [(text.get_text(), np.array(text.get_position())) for text in figure.axes[0].texts]
@@ -89,12 +92,12 @@ def test_every_turn_lies_in_its_facet_beside_its_own_arm():
             if np.linalg.norm(at / zoom - located.centre_px) < 0.5 * located.width_px and word.endswith("°")
         ]
         assert sorted(word for word, _ in in_facet) == sorted(
-            f"{turn_deg:+d}°".replace("-", "−") for turn_deg in instruction.turns_deg
+            f"{turn_deg:+g}°".replace("-", "−") for turn_deg in instruction.settable_deg
         )
-        for bolt, turn_deg in enumerate(instruction.turns_deg):
-            if list(instruction.turns_deg).count(turn_deg) > 1:
+        for bolt, turn_deg in enumerate(instruction.settable_deg):
+            if list(instruction.settable_deg).count(turn_deg) > 1:
                 continue
-            at = next(at for word, at in in_facet if word == f"{turn_deg:+d}°".replace("-", "−"))
+            at = next(at for word, at in in_facet if word == f"{turn_deg:+g}°".replace("-", "−"))
             ahead_deg = np.rad2deg(np.arctan2(-at[1], at[0])) - 120.0 * bolt  # counter-clockwise of its arm
             assert 0.0 < (ahead_deg + 180.0) % 360.0 - 180.0 < 65.0  # half-way to the next arm is 60
 
@@ -161,6 +164,17 @@ def test_large_telescopes_stay_sane(n_facets, has_turns):
     assert any("too small" in text.get_text() for text in figure.texts) != has_turns
     if has_turns:
         assert overlaps(texts_of(figure)) == []
+
+
+@pytest.mark.parametrize("side", ["front", "back"])
+def test_the_picture_says_from_which_side_bolts_are_turned(side):
+    reflector = honeycomb(7, 1.0, 28.0)
+    instrument = replace(instrument_of(reflector, {}, mount=tripod(radius_m=0.4)), bolts_seen_from=side)
+    instructions = facet_instructions(random_alignment(reflector), TEN_DEG)
+    legend = [text.get_text() for text in draw_instructions(instrument, instructions, None, "headline").figure.texts]
+    (line,) = [text for text in legend if "Bolts are turned from" in text]
+    assert ("BEHIND" in line) == ("exchanged" in line) == (side == "back")
+    assert "clockwise as you see the bolt" in line
 
 
 def test_a_telescope_without_bolts_says_so():

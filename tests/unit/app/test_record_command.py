@@ -13,9 +13,12 @@ from typer.testing import CliRunner
 from namod_ctl.app.build_twin import build_twin, load_twin_settings
 from namod_ctl.app.commands.record import record
 from namod_ctl.app.config import builtin_folder, load_config
+from namod_ctl.app.terminal import TerminalView
 from namod_ctl.app.twin_note import noted_twin
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.errors import NamodError, StoreError
+from namod_ctl.cycle.control import Request, RequestKind, send
+from namod_ctl.cycle.progress import Progress
 from namod_ctl.store.run import RunStore
 from namod_ctl.store.run_lock import recording_lock
 from namod_ctl.twin.settings import TwinSettings
@@ -204,3 +207,21 @@ def test_a_replay_that_fails_leaves_nothing_and_replaces_nothing(twin_run: Path,
     assert sorted(path.name for path in tmp_path.iterdir()) == ["COPY", "OLD"]
     with RunStore.open(old) as kept:
         assert "twin" in kept.source
+
+
+def test_a_recording_is_ended_from_another_terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run, asked = tmp_path / "RUN", []
+
+    def show(view: TerminalView, progress: Progress, *, now: bool = False) -> None:
+        if progress.n_accepted == 2 and not asked:
+            asked.append(send(run, Request(kind=RequestKind.STOP), SystemClock()))
+
+    monkeypatch.setattr(TerminalView, "show", show)
+    code, output = call("--twin", "--out", run, "--config", "mini_fact", "--records", 50, "--every", 0)
+    assert code == 0
+    assert "stopped by hand" in output
+    answer = asked[0].answer()
+    assert answer is not None
+    assert answer.is_accepted
+    with RunStore.open(run) as store:
+        assert 2 <= len(store.records()) < 10

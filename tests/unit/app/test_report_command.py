@@ -28,7 +28,7 @@ from namod_ctl.store.campaign import CampaignStore
 from namod_ctl.store.run import RunStore
 from namod_ctl.twin.settings import FaultSpec, TwinSettings
 
-VOID = {"meta", "img", "br"}
+VOID = {"meta", "img", "br", "input"}
 EVIL = "<script>alert(1)</script>\" onmouseover='x' & </td></table><img src=http://elsewhere/x onerror=y>"
 
 

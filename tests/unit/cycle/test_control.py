@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from namod_ctl.core.errors import StoreError
-from namod_ctl.cycle.control import ALL, Answer, ControlBox, Request, RequestKind, send
+from namod_ctl.cycle.control import ALL, OF_FACETS, Answer, ControlBox, Request, RequestKind, send
 
 FOLDER = "control"
 
@@ -31,9 +31,8 @@ class TickingClock:
 
 def test_requests_arrive_once_and_in_order(tmp_path: Path) -> None:
     clock = TickingClock()
-    kinds = [kind for kind in RequestKind if kind is not RequestKind.DONE]
-    requests = [Request(kind=kind) for kind in kinds]
-    requests += [Request(kind=RequestKind.DONE, facet_ids=ids) for ids in ((13, 31), ALL)]
+    requests = [Request(kind=kind) for kind in RequestKind if kind not in OF_FACETS]
+    requests += [Request(kind=kind, facet_ids=ids) for kind in sorted(OF_FACETS) for ids in ((13, 31), ALL)]
     early, late = requests[:2], requests[2:]  # to stop and to pause
     sent = [send(tmp_path, request, clock) for request in early]  # before anybody looks
     box = ControlBox(tmp_path)
@@ -141,6 +140,7 @@ def test_any_bytes_as_a_request(data: bytes, name: str) -> None:
         '{"kind": "explode"}',
         '{"kind": "stop", "facet_ids": [3]}',
         '{"kind": "done"}',
+        '{"kind": "not_done"}',
         '{"kind": "done", "facet_ids": []}',
         '{"kind": "done", "facet_ids": [1e400]}',
         '{"kind": "done", "facet_ids": [true]}',

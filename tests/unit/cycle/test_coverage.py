@@ -44,3 +44,17 @@ def test_the_share_is_that_of_the_circle() -> None:
     """An area of the circle, pi / 4 of the square, to a cell's width."""
     inside = empty_coverage(RADIUS).is_inside.mean()
     assert inside == pytest.approx(math.pi / 4.0, abs=1.0 / N_CELLS)
+
+
+def test_a_hole_is_found_wherever_a_facet_could_hide_in_it() -> None:
+    coverage = empty_coverage(RADIUS)
+    y, x = np.meshgrid(coverage.centres_rad, coverage.centres_rad, indexing="ij")
+    for hole in ([0.0, 0.0], [0.4 * RADIUS, -0.3 * RADIUS]):
+        for radius, is_hole in ((0.15 * RADIUS, False), (0.3 * RADIUS, True)):
+            covered = empty_coverage(RADIUS)
+            for theta in np.column_stack([x.ravel(), y.ravel()]):
+                if np.hypot(*(theta - hole)) > radius:
+                    covered = with_record(covered, theta)
+            assert covered.share > 0.85
+            assert covered.has_hole == is_hole, (hole, radius)
+    assert coverage.has_hole

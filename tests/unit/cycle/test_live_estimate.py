@@ -23,10 +23,14 @@ def test_it_says_what_the_reconstruction_says() -> None:
         table = made.table.select(np.arange(made.table.n_records) < n)
         estimate = running.of(table)
         if n in (180, 400):
-            facets = reconstruct(table, telescope).alignment.facets
+            alignment = reconstruct(table, telescope).alignment
+            facets = alignment.facets
             seen = {f.facet_id: np.linalg.eigvalsh(f.theta_cov_rad2)[-1] for f in facets if np.isfinite(f.theta_rad[0])}
             worst_rad = float(np.sqrt(max(seen.values())))
             assert estimate.n_records == n
+            # the same light, whatever the halves say of its uncertainty
+            assert estimate.a_sigma_rad2 == pytest.approx(alignment.now.a_sigma_rad2, rel=0.02)
+            assert estimate.a_sigma_uncertainty_rad2 == pytest.approx(alignment.now.uncertainty_rad2, rel=0.3)
             assert estimate.worst_uncertainty_rad == pytest.approx(worst_rad, rel=0.2)
             assert set(estimate.unseen_facet_ids) == set(telescope.reflector.ids) - set(seen)
 

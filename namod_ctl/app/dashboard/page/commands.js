@@ -1,11 +1,11 @@
 // Commands: who has the token may give them. To stop needs one confirmation and is always in sight.
 
-import { byId, element, nextMessage, number, setText } from "./dom.js";
+import { byId, element, nextMessage, setText } from "./dom.js";
 
 const WORDS = { pause: "Pause", resume: "Resume", approve: "Approve the correction", refuse: "Refuse it" };
 const KEY = "namod-token";
 
-let takesCommands = false;
+let isCampaign = false;
 let standing = null;
 let token = "";
 
@@ -19,7 +19,11 @@ function stored(value) {
 }
 
 export function setUpCommands(about) {
-  takesCommands = about.takes_commands;
+  isCampaign = about.kind === "campaign";
+  setText(byId("h-stop"), isCampaign ? "Stop everything?" : "Stop the recording?");
+  setText(byId("stop-means"), isCampaign
+    ? "All drives halt at once. The campaign is held until somebody has looked at the telescope and releases it."
+    : "The recording ends after the record in work. All its records are kept.");
   const given = new URLSearchParams(location.hash.slice(1)).get("token");
   token = given ? stored(given) || given : token || stored();
   if (given) history.replaceState(null, "", location.pathname); // so that nobody reads it over a shoulder
@@ -32,7 +36,7 @@ export function setUpCommands(about) {
     showTokenForm();
   };
   const dialog = byId("stop-dialog");
-  byId("stop").onclick = () => (canStop() ? dialog.showModal() : reply(whyNot()));
+  byId("stop").onclick = () => (canStop() ? dialog.showModal() : say(whyNot()));
   byId("stop-no").onclick = () => dialog.close();
   byId("stop-yes").onclick = () => {
     dialog.close();
@@ -40,8 +44,8 @@ export function setUpCommands(about) {
   };
 }
 
-const canStop = () => takesCommands && standing?.commands.includes("stop");
-const whyNot = () => (takesCommands ? "Nobody is at work on this campaign: there is nothing to stop." : "A plain recording takes no commands: press Ctrl-C in its terminal to end it.");
+const canStop = () => standing?.commands.includes("stop");
+const whyNot = () => (isCampaign ? "Nobody is at work on this campaign: there is nothing to stop." : "Nobody records this at the moment: there is nothing to stop.");
 
 function showTokenForm() {
   byId("token-form").hidden = token !== "" || !standing?.commands.length;
@@ -62,28 +66,11 @@ export function showCommands(now) {
   }));
 }
 
-export function showTurns(now) {
-  const left = now.turns.filter((turn) => !turn.is_done);
-  byId("turns-section").hidden = now.turns.length === 0;
-  setText(byId("turns-left"), `${now.turns.length - left.length} of ${now.turns.length} facets done.`);
-  byId("turns").replaceChildren(...now.turns.map((turn) => {
-    const turns = turn.turns_deg.map((degrees, i) => `bolt ${i + 1}: ${degrees > 0 ? "+" : ""}${number(degrees, 0)}°`).join(", ");
-    const line = element("li", {}, element("span", {}, `Facet ${turn.id}: ${turns}`));
-    if (turn.is_done) line.append(element("span", {}, "✓ done"));
-    else if (now.commands.includes("done")) {
-      const button = element("button", { type: "button", "aria-label": `facet ${turn.id} is done` }, "Done");
-      button.addEventListener("click", () => send({ kind: "done", facets: [turn.id] }));
-      line.append(button);
-    }
-    return line;
-  }));
-}
-
-function reply(text) {
+function say(text) {
   nextMessage(byId("reply"), text);
 }
 
-async function send(order) {
+export async function send(order, reply = say) {
   reply("asked");
   try {
     const answer = await fetch("/command", {

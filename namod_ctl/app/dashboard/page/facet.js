@@ -1,5 +1,6 @@
 // One facet: its light over star directions, its history, its legs, and what stands against it.
 
+import { legState } from "./campaign.js";
 import { colour } from "./colours.js";
 import { byId, drawn, element, ellipseMark, number, setNumbers, setText } from "./dom.js";
 import { markChosen, whenChosen } from "./mirror.js";
@@ -68,7 +69,7 @@ export function showFacetDetails(known) {
     if (facet.n_records !== null) pairs.push(["records in it", String(facet.n_records)]);
     if (facet.history.length > 1) pairs.push(["by cycle", facet.history.map(([cycle, off]) => `${cycle}: ${number(off)}`).join(", ")]);
   }
-  for (const leg of legs) pairs.push([`leg ${leg.leg}`, `${leg.position_mm === null ? "where is not known" : `${number(leg.position_mm, 3)} mm`}, ${leg.outcome.replaceAll("_", " ")}`]);
+  for (const leg of legs) pairs.push([`leg ${leg.leg}`, `${leg.position_mm === null ? "where is not known" : `${number(leg.position_mm, 3)} mm`}; ${legState(leg)}`]);
   setNumbers(byId("facet-numbers"), pairs);
   const remarks = [...(facet?.flags.map((flag) => flag.meaning) ?? []), ...(facet?.remarks ?? [])];
   if (refused) remarks.push(`stays as it is: ${refused.why}`);

@@ -57,7 +57,7 @@ export function showFacets({ of, table }) {
     node.setAttribute("aria-label", `facet ${facet.id}, ${isKnown ? `off by ${number(facet.off_arcmin)} arcmin` : "not known"}${flags ? `, ${flags}` : ""}`);
   }
   paintScale(byId("mirror-scale"));
-  setText(byId("mirror-key"), `off by 0 to ${most} arcmin; dashed: not to be moved`);
+  setText(byId("mirror-key"), `off by 0 to ${most} arcmin; dashed: not to be moved. As the reflector camera sees it, from the front.`);
 }
 
 export function showMirrorPicture(now) {

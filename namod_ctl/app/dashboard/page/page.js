@@ -1,7 +1,7 @@
 // The page: sections arrive as server-sent events, each goes to the module that draws it.
 
 import { showActuators, showJournal } from "./campaign.js";
-import { setUpCommands, showCommands, showTurns } from "./commands.js";
+import { setUpCommands, showCommands } from "./commands.js";
 import { showCoverage } from "./coverage.js";
 import { showCycles } from "./cycles.js";
 import { byId, isNight, nextMessage, setText } from "./dom.js";
@@ -9,6 +9,7 @@ import { refreshFacet, setUpFacet, showFacetDetails } from "./facet.js";
 import { setUpMirror, showFacets, showMirrorPicture } from "./mirror.js";
 import { showPsf } from "./psf.js";
 import { setClock, showRecords } from "./records.js";
+import { setUpSheet, showMarks, showSheets } from "./sheet.js";
 import { setUpStar, showStar } from "./star.js";
 
 const known = {};
@@ -23,6 +24,7 @@ const draw = {
     setUpFacet(about);
     setUpStar(about);
     setUpCommands(about);
+    setUpSheet(about);
   },
   standing(standing) {
     const before = byId("state").textContent;
@@ -33,7 +35,7 @@ const draw = {
     setText(byId("next"), standing.next);
     if (state !== before) nextMessage(byId("spoken"), `${state}. Next: ${standing.next}`);
     showCommands(standing);
-    showTurns(standing);
+    showMarks(standing);
     showFacetDetails(known);
   },
   now(now) {
@@ -54,6 +56,7 @@ const draw = {
     showFacetDetails(known);
   },
   journal: showJournal,
+  sheets: showSheets,
   trouble(text) {
     showBanner(text);
   },
@@ -92,7 +95,7 @@ function setUpMode() {
       // without storage it holds for this page
     }
     show();
-    for (const [name, value] of Object.entries(known)) if (!["about", "standing", "clock"].includes(name)) draw[name](value);
+    for (const [name, value] of Object.entries(known)) if (!["about", "standing", "clock", "sheets"].includes(name)) draw[name](value);
   });
 }
 

@@ -1,0 +1,42 @@
+"""Many numbers in few words: facet ids with runs drawn together, legs by what they have in common."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable
+
+from namod_ctl.core.drives import Leg
+
+
+def runs_in_words(numbers: Iterable[int]) -> str:
+    """Numbers in ascending order, each once, with runs of three and more drawn together: `0, 2 to 7, 10`."""
+    runs: list[list[int]] = []
+    for number in sorted(set(numbers)):
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1].append(number)
+        else:
+            runs.append([number])
+    return ", ".join(f"{run[0]} to {run[-1]}" if len(run) > 2 else ", ".join(map(str, run)) for run in runs)
+
+
+def legs_in_words(legs: Iterable[Leg]) -> str:
+    """Legs by facets of which the same ones are meant: `facets 0, 2 to 7 legs 1 to 3; facet 13 leg 2`."""
+    numbers_of: dict[int, set[int]] = defaultdict(set)
+    for leg in legs:
+        numbers_of[leg.facet_id].add(leg.index + 1)
+    facets_with: dict[frozenset[int], list[int]] = defaultdict(list)
+    for facet_id in sorted(numbers_of):
+        facets_with[frozenset(numbers_of[facet_id])].append(facet_id)
+    return "; ".join(
+        f"{_plural('facet', facet_ids)} {runs_in_words(facet_ids)} {_plural('leg', numbers)} {runs_in_words(numbers)}"
+        for numbers, facet_ids in facets_with.items()
+    )
+
+
+def counted(number: int, noun: str) -> str:
+    """`1 leg`, `2 legs`."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}es" if noun.endswith("s") else f"{number} {noun}s"
+
+
+def _plural(noun: str, what: Iterable[int]) -> str:
+    return noun if len(list(what)) == 1 else f"{noun}s"

@@ -1,0 +1,1 @@
+"""Cameras a telescope really has, each behind `core.interfaces.Camera`; vendors' libraries are imported when used."""
