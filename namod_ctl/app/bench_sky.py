@@ -1,8 +1,8 @@
 """The twin's sky in front of a maker's cameras: real libraries and drivers work on pictures that the twin has made.
 
-A camera of the bench is a twin's camera and an emulated one of a maker's library. What the twin's camera sees is written
-into a file, the library's camera reads it when it is triggered, and the frame comes back through the library and our
-driver. So a whole campaign runs through them.
+A camera of the bench is a twin's camera and an emulated one of a maker's library. What the twin's camera sees is
+written into a file, the library's camera reads it when it is triggered, and the frame comes back through the library
+and our driver. So a whole campaign runs through them.
 """
 
 from __future__ import annotations

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from namod_ctl.app.config import InstrumentConfig
 from namod_ctl.app.config_schema import RecordingSection
+from namod_ctl.core.units import deg_to_rad
 from namod_ctl.cycle.record import RecordSettings
 
 
@@ -15,5 +16,6 @@ def build_record_settings(config: InstrumentConfig) -> RecordSettings:
         shortest_s=section.shortest_exposure_s,
         longest_s=section.longest_exposure_s,
         max_motion_share=section.max_motion_share,
+        region_radius_rad=deg_to_rad(section.region_radius_deg),
         star_zero_point_mag=section.star_zero_point_mag,
     )

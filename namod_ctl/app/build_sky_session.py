@@ -12,6 +12,7 @@ from namod_ctl.app.config import InstrumentConfig, load_config
 from namod_ctl.app.twin_note import noted_twin
 from namod_ctl.core.clock import SystemClock, SystemMonotonicClock
 from namod_ctl.core.errors import ConfigError
+from namod_ctl.cycle.exposure_check import refuse_disobedient
 from namod_ctl.cycle.record import Equipment
 from namod_ctl.optics.instrument import Instrument
 from namod_ctl.store.folders import check_output
@@ -23,12 +24,16 @@ DEFAULT_CONFIG = "fact"
 
 @dataclass(frozen=True, slots=True)
 class SkySession:
-    """What is recorded with, and into what; all of it is closed by the stack that it was opened on."""
+    """What is recorded with, and into what; all of it is closed by the stack that it was opened on.
+
+    `remarks` say, for a person, how the cameras obeyed when they were tried.
+    """
 
     equipment: Equipment
     instrument: Instrument
     config: InstrumentConfig
     store: RunStore
+    remarks: list[str]
 
 
 def open_sky_session(
@@ -41,7 +46,7 @@ def open_sky_session(
     Raises
     ------
     ConfigError
-        A camera refuses a setting, the config has no outlines of the facets, something is at `out`, or `append` is of
+        A camera refuses a setting or ignores its exposure, the config has no outlines of the facets, something is at `out`, or `append` is of
         another config.
     DeviceFaultError
         There is no such camera.
@@ -51,15 +56,16 @@ def open_sky_session(
     config = load_config(config_name or DEFAULT_CONFIG)
     if out is None or not has_cameras(config):
         return None
-    instrument = _mapped_instrument(config)
+    instrument = mapped_instrument(config)
     check_output(out, force=force)
     equipment = _open_equipment(stack, config)
+    remarks = try_exposures(config, equipment, instrument)
     source = f"{equipment.star_camera.name}; {equipment.reflector_camera.name}"
     facet_ids = [facet.id for facet in config.facets]
     store = RunStore.create(out, facet_ids, config.to_json(), source, equipment.wall_clock, force)
     stack.enter_context(store)
     stack.enter_context(recording_lock(store.path))
-    return SkySession(equipment, instrument, config, store)
+    return SkySession(equipment, instrument, config, store, remarks)
 
 
 def _resumed(stack: ExitStack, run: Path, config_name: str | None) -> SkySession | None:
@@ -69,14 +75,38 @@ def _resumed(stack: ExitStack, run: Path, config_name: str | None) -> SkySession
             return None
     if config_name is not None and load_config(config_name) != config:
         raise ConfigError(f"{run}: was recorded with another config; leave --config out to go on with its own")
-    instrument = _mapped_instrument(config)
+    instrument = mapped_instrument(config)
     equipment = _open_equipment(stack, config)
+    remarks = try_exposures(config, equipment, instrument)
     store = stack.enter_context(RunStore.open(run, read_only=False))
     stack.enter_context(recording_lock(store.path))
-    return SkySession(equipment, instrument, config, store)
+    return SkySession(equipment, instrument, config, store, remarks)
 
 
-def _mapped_instrument(config: InstrumentConfig) -> Instrument:
+def try_exposures(config: InstrumentConfig, equipment: Equipment, instrument: Instrument) -> list[str]:
+    """Whether the cameras make the exposures that they are asked for, in words; not asked of folders of frames.
+
+    Raises
+    ------
+    ConfigError
+        One does not.
+    DeviceFaultError
+        One is lost.
+    """
+    cameras = (
+        (config.star_camera, equipment.star_camera, instrument.star_camera),
+        (config.reflector_camera, equipment.reflector_camera, instrument.reflector_camera),
+    )
+    asked = [
+        (camera, model, None)
+        for section, camera, model in cameras
+        if section.device is not None and section.device.driver != "folder"  # whoever fills it exposes as he likes
+    ]
+    return refuse_disobedient(asked, equipment.clock)
+
+
+def mapped_instrument(config: InstrumentConfig) -> Instrument:
+    """The telescope of a config. Raises ConfigError when it does not say where the facets are in the image."""
     instrument = build_instrument(config)
     if not instrument.facet_polygons_px:
         raise ConfigError(

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 
 import numpy as np
 
+from namod_ctl.app.bench_sky import twin_equipment
 from namod_ctl.app.build import build_instrument
 from namod_ctl.app.build_cameras import CAMERA_CLASSES, Role, open_camera, open_driver
 from namod_ctl.app.build_twin import build_twin
@@ -71,20 +72,20 @@ def open_chosen(
     ConfigError, DeviceFaultError
         There is no such camera.
     """
-    chosen = _of_config(name, config, is_twin=is_twin) if ":" not in name else None
-    if chosen is None:
-        if is_twin or config is not None:
+    with ExitStack() as stack:
+        if ":" not in name:
+            chosen = _of_config(stack, name, config, is_twin=is_twin)
+        elif is_twin or config is not None:
             raise ConfigError(
                 f"camera {name}: a driver and its camera need neither --config nor --twin; leave them out"
             )
-        chosen = _of_driver(name, size, full_scale_adu)
-    try:
+        else:
+            chosen = _of_driver(name, size, full_scale_adu)
+        stack.callback(chosen.camera.close)
         yield chosen
-    finally:
-        chosen.camera.close()
 
 
-def _of_config(name: str, config: str | None, *, is_twin: bool) -> ChosenCamera:
+def _of_config(stack: ExitStack, name: str, config: str | None, *, is_twin: bool) -> ChosenCamera:
     roles: dict[str, Role] = {"star": "star", "reflector": "reflector"}
     if name not in roles:
         raise ConfigError(
@@ -93,16 +94,19 @@ def _of_config(name: str, config: str | None, *, is_twin: bool) -> ChosenCamera:
         )
     loaded = load_config(config or DEFAULT_CONFIG)
     instrument = build_instrument(loaded)
-    model = instrument.star_camera if name == "star" else instrument.reflector_camera
-    clock: MonotonicClock
-    if is_twin:
+    model, device = instrument.star_camera, loaded.star_camera.device
+    if name == "reflector":
+        model, device = instrument.reflector_camera, loaded.reflector_camera.device
+    if is_twin or (device is not None and device.fed_by_twin):
         twin = build_twin(loaded, TwinSettings(), TWIN_SEED)
-        camera: Camera = twin.star_camera if name == "star" else twin.reflector_camera
-        clock = twin.clock
-    else:
-        clock = SystemMonotonicClock()
-        camera = open_camera(loaded, roles[name], clock)
-    return ChosenCamera(camera, model, instrument.star_size_rad, clock, True)
+        both = stack.enter_context(twin_equipment(loaded, twin))()
+        camera, other = both.star_camera, both.reflector_camera
+        if name == "reflector":
+            camera, other = other, camera
+        other.close()
+        return ChosenCamera(camera, model, instrument.star_size_rad, twin.clock, True)
+    clock = SystemMonotonicClock()
+    return ChosenCamera(open_camera(loaded, roles[name], clock), model, instrument.star_size_rad, clock, True)
 
 
 def _of_driver(name: str, size: str, full_scale_adu: float) -> ChosenCamera:

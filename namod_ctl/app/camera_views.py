@@ -29,6 +29,7 @@ from namod_ctl.imaging.exposure import (
 from namod_ctl.store.frames import write_file_durably
 
 LONGEST_S = 3.0
+TARGET_SHARE = 0.8  # as the recorder's default
 FETCH_TIMEOUT_S = 2.0
 FIRST_EXPOSURE_S = 0.05
 BAR_WIDTH = 40
@@ -71,7 +72,8 @@ class Watch:
         self._chosen, self._is_automatic = chosen, exposure_s is None
         shortest_s, longest_s = chosen.camera.exposure_range_s
         longest_s = longest_s if not self._is_automatic else min(longest_s, max(LONGEST_S, shortest_s))
-        self._rule = exposure_rule(chosen.model, max(shortest_s, 1e-6), longest_s)
+        target_share = min(TARGET_SHARE, 0.9 * chosen.model.saturation_share)
+        self._rule = exposure_rule(chosen.model, max(shortest_s, 1e-6), longest_s, target_share)
         self._exposure_s = self._rule.clipped(FIRST_EXPOSURE_S) if exposure_s is None else exposure_s
         self._guard = FrameGuard()
 

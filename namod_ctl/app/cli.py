@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from difflib import get_close_matches
 from importlib import import_module
-from typing import Any
+from typing import Any, Literal
 
 import typer
 from typer.core import TyperGroup
@@ -14,7 +14,9 @@ from namod_ctl import __version__
 from namod_ctl.app.greeting import GREETING
 from namod_ctl.core.errors import NamodError
 
-MARKUP = "markdown"  # typer's default swallows what is written in brackets, such as [default: auto]
+MARKUP: Literal["markdown"] = (
+    "markdown"  # typer's default swallows what is written in brackets, such as [default: auto]
+)
 
 # A command's module is imported when the command is called, so that none waits for the libraries of another.
 _COMMANDS = {

@@ -234,7 +234,7 @@ def _draw_row(
             x_mm = _LEFT_MM + 48.0 + column * column_mm
             share = 1.0 if n_lines == 1 else 0.86  # of the row; below two lines a note still finds room
             y_mm = top_mm - (line + 0.5) * share * row_mm / n_lines
-            _draw_turn(axes, x_mm, y_mm, bolt, turn_deg, mount, 1.0 if n_lines == 1 else 1.25 / n_lines)
+            _draw_turn(axes, x_mm, y_mm, bolt, turn_deg, 1.0 if n_lines == 1 else 1.25 / n_lines)
         axes.add_patch(Rectangle((_RIGHT_MM - 11.0, middle_mm - 3.5), 7.0, 7.0, fc="none", ec="black", lw=1.6))
     if notes:
         _write(axes, _LEFT_MM + 48.0, top_mm - row_mm + 0.8, "Note: " + "; ".join(notes), 7, va="bottom")
@@ -248,7 +248,7 @@ _NOTE_OF_FLAG = {
 }
 
 
-def _draw_turn(axes: Axes, x_mm: float, y_mm: float, bolt: int, turn_deg: float, mount: Mount, scale: float) -> None:
+def _draw_turn(axes: Axes, x_mm: float, y_mm: float, bolt: int, turn_deg: float, scale: float) -> None:
     """One bolt: its number, an arrow round it the way it is turned, and size and sense in words, whole turns apart."""
     radius_mm = _ARROW_RADIUS_MM * scale
     centre = np.array([x_mm + radius_mm, y_mm])
@@ -260,8 +260,7 @@ def _draw_turn(axes: Axes, x_mm: float, y_mm: float, bolt: int, turn_deg: float,
         axes.add_patch(Circle((float(centre[0]), y_mm), 0.8 * radius_mm, fc="none", ec="0.6", lw=1.0))
         _write(axes, x_mm, y_mm, "leave", 13 * scale, va="center")
         return
-    other = {"clockwise": "counterclockwise", "counterclockwise": "clockwise"}
-    sense = mount.turn_raises_leg if turn_deg > 0 else other[mount.turn_raises_leg]
+    sense = "clockwise" if turn_deg > 0 else "counterclockwise"
     _draw_round_arrow(axes, centre, radius_mm, is_clockwise=sense == "clockwise", scale=scale)
     words = turn_in_words(abs(turn_deg))
     size_pt = min(15.0, 112.0 / len(words)) * scale  # `12 turns + 345°` still fits beside the next bolt

@@ -35,7 +35,7 @@ class FacetInstruction:
     Attributes
     ----------
     turns_deg
-        Whole degrees per bolt, positive raises the leg (towards the sky). Empty where nobody should turn, and
+        Whole degrees per bolt, positive clockwise as seen by the person who turns. Empty where nobody should turn, and
         where there are no bolts. Where no turn is needed it holds the turns too small to be made. For programs.
     settable_deg
         The same turns as a person can set them: multiples of what the goniometer resolves. For people.

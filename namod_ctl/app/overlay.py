@@ -289,8 +289,6 @@ def _inside(facet: FacetInPicture, leg_px: Array, radius_px: float) -> Array:
 def _legend_lines(
     instrument: Instrument, by_id: Mapping[int, FacetInstruction], headline: str, is_legible: bool
 ) -> list[str]:
-    senses = {mount.turn_raises_leg for mount in instrument.mounts.values()}
-    sense = f"+ is {senses.pop()}" if len(senses) == 1 else "the sense of + differs between facets (see the sheets)"
     has_bolts = any(instruction.verdict is not Verdict.NO_BOLTS for instruction in by_id.values())
     if not has_bolts:
         explanation = "This telescope has no bolts: its legs are driven, see leg_travel_m in alignment.json."
@@ -306,9 +304,11 @@ def _legend_lines(
         )
     side = "The picture is seen from the FRONT of the mirror, from its focal point. "
     if has_bolts and instrument.bolts_seen_from == "back":
-        side += f"Bolts are turned from BEHIND it: there left and right are exchanged, and {sense} as you see the bolt."
+        side += (
+            "Bolts are turned from BEHIND it: there left and right are exchanged, and + is clockwise as you see them."
+        )
     elif has_bolts:
-        side += f"Bolts are turned from the FRONT, too: {sense} as you see the bolt."
+        side += "Bolts are turned from the FRONT, too: + is clockwise as you see them."
     return [headline, explanation, side]
 
 

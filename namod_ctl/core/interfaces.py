@@ -22,7 +22,7 @@ class Exposure:
     mid_exposure_s
         Middle of the exposure on the cameras' common monotonic clock, s.
     frame_id
-        Count of the camera; a gap is a lost frame, a repetition a stale one.
+        Count of the camera, or of its starts where it has none; a gap is a lost frame, a repetition a stale one.
     """
 
     image: NDArray[np.unsignedinteger[Any]]
@@ -32,7 +32,11 @@ class Exposure:
 
 
 class Camera(Protocol):
-    """One camera: exposures are started, and fetched when they are done."""
+    """One camera: exposures are started, and fetched when they are done.
+
+    One thread starts and fetches; another one may `close` meanwhile. What every camera keeps to is tested by one suite,
+    `tests/contract/camera_contract.py`.
+    """
 
     @property
     def name(self) -> str:
@@ -45,14 +49,14 @@ class Camera(Protocol):
         ...
 
     def start(self, exposure_s: float) -> None:
-        """Begin an exposure and return at once.
+        """Begin an exposure and return at once; one that runs is given up, and its frame never delivered.
 
         Raises
         ------
         LimitError
-            The exposure is outside of `exposure_range_s`.
+            The exposure is outside of `exposure_range_s`; nothing has happened, an exposure that runs goes on.
         DeviceFaultError
-            The camera is lost.
+            The camera is lost or closed.
         """
         ...
 
@@ -62,14 +66,15 @@ class Camera(Protocol):
         Raises
         ------
         CommunicationError
-            No frame, an incomplete or a torn one, within `timeout_s` after the exposure's end: try again.
+            No frame, an incomplete or a torn one, within `timeout_s` after the exposure's end: try again. Also when no
+            exposure was begun, or the camera is closed meanwhile.
         DeviceFaultError
-            The camera is lost.
+            The camera is lost, which it stays until it is opened again, or was closed before.
         """
         ...
 
     def close(self) -> None:
-        """Abort a running exposure and let go of the device; harmless when closed already."""
+        """Abort a running exposure and let go of the device, within half a second; harmless when closed already."""
         ...
 
 

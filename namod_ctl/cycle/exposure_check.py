@@ -52,8 +52,8 @@ MIN_LIGHT_SHARE = 0.1
 """Of full scale: with less at the longest of the exposures, too little is left at the shortest."""
 
 N_LEVELS = 3
-MIN_ROUNDS, MAX_ROUNDS = 3, 8
-"""Up and down is a round, four steps of the exposure."""
+MIN_ROUNDS, MAX_ROUNDS = 3, 12
+"""Up and down is a round, four steps of the exposure; 12 decide under light that jumps by 20 % from frame to frame."""
 
 N_MISSES = 5
 
@@ -98,7 +98,8 @@ def check_exposure(
     """
     shortest_s, longest_s = camera.exposure_range_s
     longest_s = min(longest_s, max(LONGEST_S, shortest_s))
-    rule = exposure_rule(model, max(shortest_s, 1e-6), longest_s, target_share=TARGET_SHARE)
+    target_share = min(TARGET_SHARE, 0.8 * model.saturation_share)
+    rule = exposure_rule(model, max(shortest_s, 1e-6), longest_s, target_share)
     for _ in range(N_STARTS):
         check = _checked_once(_Look(camera, model, clock, rule, region, timeout_s), camera.name, rule)
         if check.verdict is not ExposureFinding.UNKNOWN or not check.levels:

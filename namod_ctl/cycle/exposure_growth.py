@@ -30,8 +30,8 @@ FOLLOWS_FROM, FOLLOWS_TO = 0.6, 1.5
 """Growth of the light, in units of what is expected, of a camera that does what it is told: its law is known to some
 10 %, offsets and sky that are taken for light make it smaller; a camera that ignores the exposure shows 0."""
 
-SIGMAS = 3.0
-ERROR_OF_MEDIAN = 1.2533  # of normal noise, in units of the mean's: sqrt(pi / 2)
+SIGMAS = 3.5
+ERROR_OF_MEDIAN = SIGMA_PER_MEAN_DEVIATION = 1.2533  # of normal noise, the first in units of the mean's: sqrt(pi / 2)
 _REMEDY = (
     "Switch its automatic exposure, gain and gamma off, and end other programs that use it; a camera without a fixed "
     "exposure cannot be recorded with"
@@ -115,7 +115,8 @@ class _Step:
     @property
     def is_wrong(self) -> bool:
         margin = SIGMAS * self.growth_sigma
-        return self.growth + margin < FOLLOWS_FROM or self.growth - margin > FOLLOWS_TO
+        is_off = self.growth + margin < FOLLOWS_FROM or self.growth - margin > FOLLOWS_TO
+        return is_off and self.growth_sigma <= MAX_UNCERTAINTY
 
     @property
     def is_right(self) -> bool:
@@ -177,13 +178,16 @@ def _moves(low: ExposureLevel, high: ExposureLevel, asked_s: Array, light: Array
 
 
 def _sigma_of_a_move(moves: list[tuple[Array, Array]]) -> float:
-    """Standard deviation of one step: of all together, as a few may be alike by chance; a satellite does not count."""
+    """Standard deviation of one step: from all together, as a few may be alike by chance.
+
+    From the mean deviation: nearly as sure as from the squares, and a satellite counts less.
+    """
     deviations = [steps - np.median(steps) for both in moves for steps in both if len(steps) >= MIN_STEPS]
     if not deviations:
         return math.inf
     n_free = sum(map(len, deviations)) - len(deviations)  # each median takes one
     share = n_free / sum(map(len, deviations))
-    return float(1.4826 * np.median(np.abs(np.concatenate(deviations))) / math.sqrt(share))
+    return float(SIGMA_PER_MEAN_DEVIATION * np.mean(np.abs(np.concatenate(deviations))) / math.sqrt(share))
 
 
 def _step(low: ExposureLevel, high: ExposureLevel, ups: Array, downs: Array, sigma: float, rule: ExposureRule) -> _Step:

@@ -27,10 +27,10 @@ SAMPLE_STEP = 16
 N_REMEMBERED = 8
 """Frames back: a driver's ring of buffers is rarely longer, and a camera that hangs shows them again in turn."""
 
-MIN_TURNS = 200
+MIN_TURNS = 50
 MIN_TURN_SHARE = 0.01
-"""Pixels above, or below, both of their neighbours in the row. Where one pixel of a hundred toggles between two values
-at random, 200 of them are the same twice with a chance of 1e-19; light without noise has slopes, but few turns."""
+"""Pixels above, or below, both of their neighbours in the row. Light without noise has slopes, but few of these; and
+where each of 50 is one of two values at random, all are the same twice with a chance of 1e-15."""
 
 LATE_S = 0.1
 """A frame of an earlier exposure ended a timeout (2 s) before this one began; clocks agree better than that."""
@@ -57,6 +57,7 @@ class FrameGuard:
         self.n_missed = 0
         self._last_frame_id: int | None = None
         self._last_rows: Frame | None = None
+        self._has_changed = np.zeros(0, dtype=np.bool_)
         self._digests: deque[bytes] = deque(maxlen=N_REMEMBERED)
 
     def fault(self, exposure: Exposure, started_s: float = -math.inf) -> tuple[FrameFault, str] | None:
@@ -74,7 +75,11 @@ class FrameGuard:
         self._last_frame_id = exposure.frame_id
         early_s = started_s - (exposure.mid_exposure_s + exposure.exposure_s / 2.0)
         if early_s > LATE_S:
-            return FrameFault.LATE, f"frame {exposure.frame_id} is {early_s:.2g} s older than the exposure it came for"
+            return (
+                FrameFault.LATE,
+                f"frame {exposure.frame_id} ended {early_s:.2g} s before the exposure began that it came for: it came "
+                "late, or the clock that dated it is wrong",
+            )
         n_missing = _n_rows_missing(exposure.image)
         if n_missing:
             return (
@@ -87,9 +92,9 @@ class FrameGuard:
         """Whether the frame, or its end, is that of an earlier one."""
         rows = np.ascontiguousarray(exposure.image[SAMPLE_STEP // 2 :: SAMPLE_STEP])
         digest = hashlib.blake2b(rows.tobytes(), digest_size=16, usedforsecurity=False).digest()
-        is_known, before = digest in self._digests, self._last_rows
+        is_known = digest in self._digests
         self._digests.append(digest)
-        self._last_rows = rows
+        n_old = self._n_old_rows(rows)
         if is_known:
             if not _has_noise(rows):
                 return None
@@ -97,7 +102,6 @@ class FrameGuard:
                 FrameFault.REPEATED,
                 f"frame {exposure.frame_id} is an earlier one over again, with the same noise in every pixel",
             )
-        n_old = 0 if before is None else _n_same_at_end(rows, before)
         if n_old and _has_noise(rows[-n_old:]):
             return (
                 FrameFault.INCOMPLETE,
@@ -105,6 +109,20 @@ class FrameGuard:
                 "frame before",
             )
         return None
+
+    def _n_old_rows(self, rows: Frame) -> int:
+        """Sampled rows at the end of a frame that are those of the frame before, and were others some time before.
+
+        Rows that never change are no sensor's: some cameras and programs write into the last rows what they know.
+        """
+        before, self._last_rows = self._last_rows, rows
+        if before is None or rows.shape != before.shape or rows.dtype != before.dtype:
+            self._has_changed = np.zeros(len(rows), dtype=np.bool_)
+            return 0
+        is_old = (rows == before).reshape(len(rows), -1).all(axis=1)
+        self._has_changed |= ~is_old
+        is_suspect = is_old & self._has_changed
+        return len(rows) if is_suspect.all() else int(np.argmin(is_suspect[::-1]))
 
 
 def _n_rows_missing(image: Frame) -> int:
@@ -120,13 +138,6 @@ def _n_rows_missing(image: Frame) -> int:
     n_missing = int(np.argmax(has_light[::-1]))
     n_arrived = len(image) - n_missing
     return n_missing if n_missing >= TORN_ROWS and bool(has_light[:n_arrived].all()) else 0
-
-
-def _n_same_at_end(rows: Frame, before: Frame) -> int:
-    if rows.shape != before.shape or rows.dtype != before.dtype:
-        return 0
-    is_same = (rows == before).reshape(len(rows), -1).all(axis=1)
-    return len(rows) if is_same.all() else int(np.argmin(is_same[::-1]))
 
 
 def _has_noise(rows: NDArray[Any]) -> bool:

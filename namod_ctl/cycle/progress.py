@@ -176,7 +176,9 @@ class Tracker:
         rejected = Counter(
             reason for time_s, reason in self.recent if time_s > self.last_accepted_s and reason is not None
         )
-        return warning_text(now_s - self.last_accepted_s, rejected, since)
+        text = warning_text(now_s - self.last_accepted_s, rejected, since)
+        # what is being tried to bring a camera back, and what a person can do
+        return f"{text}; {source.trouble}" if since[DropCause.CAMERA_LOST] and source.trouble else text
 
 
 def magnitude(intensity: float) -> float:

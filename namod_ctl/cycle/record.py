@@ -107,8 +107,8 @@ class StopRule:
     uncertainty_rad
         Of the facet that is known worst. Facets that were not seen hold it up until the region is covered.
     min_coverage
-        Share of the region below which, as with a hole in it, up to `MAX_FACTOR` times `n_records` are taken: a recording
-        with gaps misses facets.
+        Share of the region below which, as with a hole in it, up to `MAX_FACTOR` times `n_records` are taken: a
+        recording with gaps misses facets.
     """
 
     n_records: int | None = None

@@ -18,7 +18,7 @@ import usb.control  # type: ignore[import-untyped]
 import usb.core  # type: ignore[import-untyped]
 import usb.util  # type: ignore[import-untyped]
 
-# usb.ids, version 2023.01.16 (linux-usb.org); 1618 and 20e7 from the udev rules that QHYCCD and Atik ship
+# usb.ids, version 2025.07.26 (linux-usb.org); but 1618 and 20e7, which it does not list, as QHYCCD and Atik use them
 CAMERA_MAKERS = {
     0x03C3: "ZWO",
     0x0D97: "Santa Barbara Instrument Group",
@@ -34,12 +34,12 @@ CAMERA_MAKERS = {
     0x20F7: "XIMEA",
     0x2676: "Basler AG",
 }
-# usb.ids; the newer CH34x (55d2 to 55d4) and PL2303 (23b3 to 23f3) as in the drivers of Linux 6.1
+# Chips that have no class of their own, by usb.ids; the newer PL2303 (23b3 to 23f3) by Linux' pl2303.h
 SERIAL_CHIPS = {
     0x0403: ("FTDI", frozenset({0x6001, 0x6010, 0x6011, 0x6014, 0x6015})),
     0x067B: ("Prolific", frozenset({0x2303, 0x23A3, 0x23B3, 0x23C3, 0x23D3, 0x23E3, 0x23F3})),
     0x10C4: ("Silicon Labs", frozenset({0xEA60, 0xEA61, 0xEA63, 0xEA70, 0xEA71})),
-    0x1A86: ("QinHeng", frozenset({0x5523, 0x55D2, 0x55D3, 0x55D4, 0x7522, 0x7523})),
+    0x1A86: ("QinHeng", frozenset({0x5523, 0x7522, 0x7523})),
 }
 
 # USB class codes (usb.org, Defined Class Codes): class, subclass
@@ -315,8 +315,8 @@ def _is_forbidden(device: Any) -> bool:
         usb.util.get_langids(device)
     except usb.core.USBError as error:
         return error.errno in (errno.EACCES, errno.EPERM)
-    except NotImplementedError:  # Windows without a driver for it
-        return True
+    except NotImplementedError:  # Windows without a driver for it, of which udev knows nothing
+        return False
     return False
 
 

@@ -36,6 +36,11 @@ class ForeignServer:
         self._command, self._log, self._environment = list(command), log, dict(environment)
         self._process: subprocess.Popen[bytes] | None = None
 
+    @property
+    def is_running(self) -> bool:
+        """False before `start`, and after `kill`."""
+        return self._process is not None
+
     def start(self) -> None:
         """Start it and return when it takes connections."""
         with self._log.open("ab") as log:

@@ -5,6 +5,7 @@ It is a program of its own, on purpose without a line of the project: FITS by as
 
 from __future__ import annotations
 
+import contextlib
 import json
 import threading
 from collections.abc import Callable
@@ -86,7 +87,8 @@ class FrameProgram:
             self.n_to_lose -= 1
             return
         self._n_frames += 1
-        self._write(self._folder / f"frame_{self._n_frames:04d}_{request}", pixels, exposure_s, request)
+        with contextlib.suppress(FileNotFoundError):  # somebody took the disk away
+            self._write(self._folder / f"frame_{self._n_frames:04d}_{request}", pixels, exposure_s, request)
 
     def expose(self, exposure_s: float) -> np.ndarray:
         """The pixels, when the exposure is over; at once at the end of the program."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -44,6 +45,8 @@ def indi_server(folder: Path) -> IndiServer:
     for program in ("indiserver", "indi_simulator_ccd", "indi_simulator_guide", "indi_setprop"):
         if shutil.which(program) is None:
             pytest.skip(f"{program} is not installed (apt install indi-bin)")
+    if find_spec("indipyclient") is None:
+        pytest.skip("indipyclient is not installed (pip install 'namod-ctl[indi]')")
     (folder / ".indi").mkdir()
     for camera in (CAMERA, OTHER_CAMERA):
         config = f"<INDIDriver>{_POLLING.format(camera)}</INDIDriver>"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import socket
 import threading
+import time
 from dataclasses import dataclass
 
 _PIECE = 65536
@@ -23,9 +24,16 @@ class Loss:
 
 
 class TcpRelay:
-    """Passes connections to `port` of this computer on to another one; `port_to` may change hands meanwhile."""
+    """Passes connections to its `port` on to another one of this computer; `port_to` may change hands meanwhile.
+
+    Attributes
+    ----------
+    answer_delay_s
+        By which every piece from the server comes later.
+    """
 
     def __init__(self, port_to: int) -> None:
+        self.answer_delay_s = 0.0
         self._port_to = port_to
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port = int(self._listener.getsockname()[1])
@@ -89,6 +97,7 @@ class TcpRelay:
         """Like others, but with losses; what could be the beginning of one waits for the next piece."""
         held = b""
         while data := source.recv(_PIECE):
+            time.sleep(self.answer_delay_s)
             held += data
             loss = self._losses[0] if self._losses else Loss(b"")
             at = held.find(loss.begin) if loss.begin else -1

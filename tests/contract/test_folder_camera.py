@@ -257,13 +257,37 @@ def test_signed_and_coloured_fits(folder: Path) -> None:
     fits.PrimaryHDU(planes, fits.Header({"EXPTIME": 1.0})).writeto(path, overwrite=True)
     assert np.array_equal(read_frame_file(path).image, COLOUR)
     fits.PrimaryHDU(DEEP.astype(np.float32), fits.Header({"EXPTIME": 1.0})).writeto(path, overwrite=True)
-    with pytest.raises(CommunicationError, match=r"float32.*unsigned"):
+    with pytest.raises(CommunicationError, match=r"BITPIX = -32.*unsigned"):
         read_frame_file(path)
     fits.PrimaryHDU(DEEP).writeto(path, overwrite=True)
     with pytest.raises(CommunicationError, match="EXPTIME or EXPOSURE"):
         read_frame_file(path)
     fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(DEEP)]).writeto(path, overwrite=True)
     with pytest.raises(CommunicationError, match="no image in its first part"):
+        read_frame_file(path)
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=150)
+@given(place=st.integers(0, 2879), byte=st.integers(0, 255), more=st.binary(max_size=8))
+@pytest.mark.filterwarnings("ignore")  # astropy's, about cards
+def test_a_damaged_fits_header_is_a_frame_or_refused(folder: Path, place: int, byte: int, more: bytes) -> None:
+    data = bytearray(_bytes_of(".fits"))
+    data[place] = byte
+    data[place : place + len(more)] = more
+    path = folder / "frame.fits"
+    path.write_bytes(data)
+    try:
+        frame = read_frame_file(path)
+    except (UnfinishedFileError, CommunicationError):
+        return
+    assert frame.image.dtype in (np.uint8, np.uint16)
+    assert 0.0 < frame.exposure_s < math.inf
+
+
+def test_negative_pixels_are_refused(folder: Path) -> None:
+    path = folder / "frame.fits"
+    fits.PrimaryHDU(np.full((ROWS, COLUMNS), -1, dtype=np.int16), fits.Header({"EXPTIME": 1.0})).writeto(path)
+    with pytest.raises(CommunicationError, match="negative pixels"):
         read_frame_file(path)
 
 

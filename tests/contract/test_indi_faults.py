@@ -95,6 +95,14 @@ def test_a_driver_that_crashed_is_told_and_can_be_opened_again(
     camera.close()
 
 
+def test_another_program_that_only_looks_does_no_harm(server: IndiServer, camera: IndiCamera) -> None:
+    """The server then tells all its clients of all properties anew."""
+    subprocess.run(["indi_getprop", "-p", str(server.port), "-t", "1"], check=False, timeout=30, capture_output=True)
+    camera.start(0.3)
+    subprocess.run(["indi_getprop", "-p", str(server.port), "-t", "1"], check=False, timeout=30, capture_output=True)
+    assert camera.fetch(3.0).exposure_s == pytest.approx(0.3)
+
+
 def test_another_program_that_disconnects_the_camera_is_told(server: IndiServer, camera: IndiCamera) -> None:
     camera.start(3.0)
     tell(server, "CONNECTION.DISCONNECT=On")

@@ -3,19 +3,26 @@ when they are asked for, as files. In real time, as drivers live in it."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 from frame_program import FrameProgram, Write, write_fits, write_png
+from typer.testing import CliRunner
 
 from namod_ctl.app.build_recording import build_record_settings
 from namod_ctl.app.build_sky_session import open_sky_session
 from namod_ctl.app.build_twin import build_twin
+from namod_ctl.app.commands.record import record
 from namod_ctl.app.config import load_config
 from namod_ctl.core.clock import SystemMonotonicClock
+from namod_ctl.cycle.progress import Progress
 from namod_ctl.cycle.record import Recorder, StopRule
+from namod_ctl.store.run import RunStore
 from namod_ctl.twin.camera import TwinCamera
 from namod_ctl.twin.settings import TwinSettings
 from namod_ctl.twin.twin import Twin
@@ -63,30 +70,87 @@ def write_config(folder: Path, twin: Twin) -> str:
     return str(folder / "telescope.toml")
 
 
-def test_a_recording_from_folders_sees_the_star_where_it_is(tmp_path: Path) -> None:
+@dataclass(frozen=True, slots=True)
+class Site:
+    """A small telescope with a program behind each folder.
+
+    Attributes
+    ----------
+    begun_s
+        When the twin's time was 0, on the computer's clock.
+    """
+
+    twin: Twin
+    config_name: str
+    begun_s: float
+    folder: Path
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[Site]:
     (tmp_path / "small.toml").write_text(SMALL)
     twin = build_twin(load_config(tmp_path / "small.toml"), TwinSettings(), seed=1)
-    config_name = write_config(tmp_path, twin)
-    begun_s = CLOCK.monotonic_s()
+    site = Site(twin, write_config(tmp_path, twin), CLOCK.monotonic_s(), tmp_path)
+    with (
+        TwinProgram(tmp_path / "star", twin.star_camera, twin, site.begun_s, write_fits, DEEPENED),
+        TwinProgram(tmp_path / "reflector", twin.reflector_camera, twin, site.begun_s, write_png, 1),
+    ):
+        yield site
+
+
+def test_the_star_is_seen_where_it_is(site: Site) -> None:
     with ExitStack() as stack:
-        for role, camera, write, factor in (
-            ("star", twin.star_camera, write_fits, DEEPENED),
-            ("reflector", twin.reflector_camera, write_png, 1),
-        ):
-            stack.enter_context(TwinProgram(tmp_path / role, camera, twin, begun_s, write, factor))
-        session = open_sky_session(stack, tmp_path / "run", None, config_name, force=False)
+        session = open_sky_session(stack, site.folder / "run", None, site.config_name, force=False)
         assert session is not None
         settings = build_record_settings(session.config)
         recorder = Recorder(session.equipment, session.instrument, session.store, settings)
-        run_begun_s = CLOCK.monotonic_s() - begun_s
+        run_begun_s = CLOCK.monotonic_s() - site.begun_s
         recorder.record(StopRule(n_records=N_RECORDS, duration_s=60.0))
-        records = [record for record in session.store.records() if record.reject_reason is None]
+        records = [entry for entry in session.store.records() if entry.reject_reason is None]
     assert len(records) == N_RECORDS
-    seen_rad = np.array([record.theta_rad for record in records])
-    true_rad = np.array([twin.true_star_theta_rad(r.star_mid_exposure_s + run_begun_s) for r in records])
+    seen_rad = np.array([entry.theta_rad for entry in records])
+    true_rad = np.array([site.twin.true_star_theta_rad(r.star_mid_exposure_s + run_begun_s) for r in records])
     assert np.ptp(true_rad, axis=0).max() > 1e-4  # it has moved
     # in 50 ms, more than the way through the file system takes, the star moves by 1.5e-5; the rest is its measurement
     assert seen_rad == pytest.approx(true_rad, abs=4e-5)
-    assert all(np.isfinite(record.facet_intensity).sum() >= 1 for record in records)
-    assert max(abs(record.mid_exposure_difference_s) for record in records) < 0.05
-    assert not list(tmp_path.glob("*/request.json"))
+    assert all(np.isfinite(entry.facet_intensity).sum() >= 1 for entry in records)
+    assert max(abs(entry.mid_exposure_difference_s) for entry in records) < 0.05
+    assert not list(site.folder.glob("*/request.json"))
+
+
+def test_a_folder_that_goes_and_comes_back_holds_the_recording_meanwhile(site: Site) -> None:
+    star, away = site.folder / "star", site.folder / "star_unmounted"
+    troubles: list[str] = []
+
+    def on_progress(progress: Progress) -> None:
+        if progress.n_accepted == 2 and not troubles and star.exists():
+            star.rename(away)
+        if progress.source.trouble and not star.exists():
+            troubles.append(progress.source.trouble)
+            away.rename(star)
+
+    with ExitStack() as stack:
+        session = open_sky_session(stack, site.folder / "run", None, site.config_name, force=False)
+        assert session is not None
+        recorder = Recorder(session.equipment, session.instrument, session.store, build_record_settings(session.config))
+        recorder.record(StopRule(n_records=5, duration_s=60.0), on_progress)
+        assert [entry.index for entry in session.store.records()] == list(range(5))
+    assert len(troubles) == 1
+    assert "the folder is gone" in troubles[0]
+
+
+def test_the_command_records_the_cameras_of_its_config_and_goes_on_with_the_run(site: Site) -> None:
+    out = site.folder / "run"
+    app = typer.Typer()
+    app.command()(record)
+    for arguments in (["--config", site.config_name, "--out", str(out)], ["--append", str(out)]):
+        n_wanted = "3" if "--out" in arguments else "5"
+        result = CliRunner().invoke(app, [*arguments, "--records", n_wanted])
+        assert result.exit_code == 0, result.output
+        assert f"{n_wanted} records count" in result.output
+        assert "twin" not in result.output
+    with RunStore.open(out) as store:
+        assert str(site.folder / "star") in store.source
+        times_s = [entry.star_mid_exposure_s for entry in store.records()]
+    assert np.all(np.diff(times_s) > 0.0)
+    assert times_s[3] - times_s[2] > 50.0  # another session of the same run

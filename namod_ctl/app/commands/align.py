@@ -16,6 +16,8 @@ import typer
 from rich.console import Console
 
 from namod_ctl.app.align_view import AlignView, cycle_table
+from namod_ctl.app.build_cameras import has_cameras
+from namod_ctl.app.build_sky_campaign import check_hardware, open_sky_campaign
 from namod_ctl.app.build_twin import load_twin_settings
 from namod_ctl.app.build_twin_campaign import open_twin_campaign
 from namod_ctl.app.campaign_report import write_campaign_report
@@ -25,12 +27,15 @@ from namod_ctl.app.twin_note import note_twin, noted_twin
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.motion import StopSwitch
+from namod_ctl.cycle.campaign import Campaign
 from namod_ctl.cycle.campaign_parts import CampaignSettings
 from namod_ctl.cycle.machine import FINAL
 from namod_ctl.cycle.record import RecordSettings
 from namod_ctl.store.campaign import CampaignStore
+from namod_ctl.store.folders import check_output
 from namod_ctl.store.import_namod import KeepFrames
 from namod_ctl.twin.settings import TwinSettings
+from namod_ctl.twin.twin import Twin
 
 DEFAULT_CONFIG = "fact_actuated"
 DEFAULT_OUT = Path("CAMPAIGN")
@@ -50,12 +55,11 @@ class Approve(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class _Start:
-    """What a campaign begins with."""
+    """What a campaign begins with; `twin` is the twin's settings and seed, None for the telescope itself."""
 
     store: CampaignStore
     config: InstrumentConfig
-    settings: TwinSettings
-    seed: int
+    twin: tuple[TwinSettings, int] | None
 
 
 def align(
@@ -85,6 +89,9 @@ def align(
             "or as begun]"
         ),
     ] = None,
+    twin: Annotated[
+        bool, typer.Option("--twin", help="Rehearse on the digital twin of a config that names cameras.")
+    ] = False,
     seed: Annotated[int | None, typer.Option(min=0, help="Of the twin: another seed is another telescope.")] = None,
     twin_settings: Annotated[
         Path | None, typer.Option("--twin-settings", metavar="FILE", help="Faults and sky of the twin, a TOML file.")
@@ -96,27 +103,29 @@ def align(
 ) -> None:
     """Align the telescope: record, reconstruct and correct until the point spread function has converged.
 
-    Facets with motors are moved; without actuators in the config people get sheets with bolt turns. From another
-    terminal: namod-ctl status, pause, resume, stop, approve, done. Ctrl-C stops all motion and holds the campaign.
+    A config that names no cameras is aligned on its digital twin. Facets with motors are moved; without actuators in
+    the config people get sheets with bolt turns. From another terminal: namod-ctl status, pause, resume, stop, approve,
+    done. Ctrl-C stops all motion and holds the campaign.
 
     Example: namod-ctl align --out CAMPAIGN
     """
     console = Console(highlight=False)
     with ExitStack() as stack:
         if resume is not None:
-            start = _resumed(stack, resume, config, seed, twin_settings, out)
+            if twin or any(option is not None for option in (config, seed, twin_settings, out)):
+                raise ConfigError("--resume CAMPAIGN goes on with the campaign's own config and twin: leave others out")
+            start = _resumed(stack, resume)
         else:
-            start = _begun(stack, out or DEFAULT_OUT, config or DEFAULT_CONFIG, seed, twin_settings, force=force)
+            is_twin = twin or seed is not None or twin_settings is not None
+            chosen = out or DEFAULT_OUT, config or DEFAULT_CONFIG
+            start = _begun(stack, *chosen, seed, twin_settings, is_twin=is_twin, force=force)
         store = start.store
         if _has_ended(store, console):
             return
         wishes = _wishes(store, records, cycles, approve, keep_frames)
         switch = StopSwitch()
         view = stack.enter_context(AlignView(console))
-        opened = stack.enter_context(
-            open_twin_campaign(store, start.config, start.settings, start.seed, wishes, SystemClock(), switch, view)
-        )
-        twin = opened.twin
+        campaign, its_twin = _opened(stack, start, wishes, switch, view)
         if dashboard:
             console.print(
                 f"live page: {stack.enter_context(dashboard_beside(store.path))}", soft_wrap=True, markup=False
@@ -125,41 +134,67 @@ def align(
         stack.callback(write_campaign_report, store.path)
         stack.enter_context(store)
         with _stopped_by_sigterm():
-            state = opened.campaign.run()
+            state = campaign.run()
         console.print(cycle_table(store.cycles()))
-        ratio = twin.reflector.a_sigma_now_rad2() / twin.reflector.a_sigma_aligned_rad2()
-        console.print(f"The twin's truth: A_sigma is {ratio:.3f} times that of the same facets perfectly aligned.")
+        if its_twin is not None:
+            its_twin.update(its_twin.clock.monotonic_s())  # facets follow what the drives did last
+            reflector = its_twin.reflector
+            ratio = reflector.a_sigma_now_rad2() / reflector.a_sigma_aligned_rad2()
+            console.print(f"The twin's truth: A_sigma is {ratio:.3f} times that of the same facets perfectly aligned.")
         console.print(f"{store.path}: {state}; report in {store.path / 'report'}", soft_wrap=True, markup=False)
     if state != "converged":
         raise typer.Exit(EXIT_HELD)
 
 
 def _begun(
-    stack: ExitStack, out: Path, config: str, seed: int | None, twin_settings: Path | None, *, force: bool
+    stack: ExitStack,
+    out: Path,
+    config_name: str,
+    seed: int | None,
+    twin_settings: Path | None,
+    *,
+    is_twin: bool,
+    force: bool,
 ) -> _Start:
-    instrument_config = load_config(config)
-    settings = TwinSettings() if twin_settings is None else load_twin_settings(twin_settings)
-    chosen = DEFAULT_SEED if seed is None else seed
-    source = f"digital twin of {instrument_config.telescope.name}, seed {chosen}"
-    store = stack.enter_context(CampaignStore.create(out, instrument_config.to_json(), source, SystemClock(), force))
-    note_twin(store, settings, chosen)
-    return _Start(store, instrument_config, settings, chosen)
+    config = load_config(config_name)
+    twin = None
+    if is_twin or not has_cameras(config):
+        settings = TwinSettings() if twin_settings is None else load_twin_settings(twin_settings)
+        twin = settings, DEFAULT_SEED if seed is None else seed
+        source = f"digital twin of {config.telescope.name}, seed {twin[1]}"
+    else:
+        check_output(out, force=force)
+        source = f"{config.telescope.name}; {', '.join(check_hardware(config))}"
+    store = stack.enter_context(CampaignStore.create(out, config.to_json(), source, SystemClock(), force))
+    if twin is not None:
+        note_twin(store, *twin)
+    return _Start(store, config, twin)
 
 
-def _resumed(
-    stack: ExitStack, path: Path, config: str | None, seed: int | None, twin_settings: Path | None, out: Path | None
-) -> _Start:
-    if config is not None or seed is not None or twin_settings is not None or out is not None:
-        raise ConfigError("--resume CAMPAIGN goes on with the campaign's own config and twin: leave the others out")
+def _resumed(stack: ExitStack, path: Path) -> _Start:
     store = stack.enter_context(CampaignStore.open(path, read_only=False))
-    noted = noted_twin(store)
-    if noted is None and store.last_state() is None:
+    twin = noted_twin(store)
+    if twin is None and store.last_state() is None:
+        # whether it was to be the twin or the telescope itself nobody can tell
         raise ConfigError(
             f"{path}: was killed in its first moment and is empty: begin it again, with --out and --force"
         )
-    if noted is None:
-        raise ConfigError(f"{path}: was not begun on the twin, and there are no drivers for cameras yet")
-    return _Start(store, InstrumentConfig.from_json(store.config_json, f"{path}: config"), *noted)
+    config = InstrumentConfig.from_json(store.config_json, f"{path}: config")
+    if twin is None and not has_cameras(config):
+        raise ConfigError(f"{path}: was not begun on the twin, and its config names no cameras")
+    return _Start(store, config, twin)
+
+
+def _opened(
+    stack: ExitStack, start: _Start, wishes: CampaignSettings, switch: StopSwitch, view: AlignView
+) -> tuple[Campaign, Twin | None]:
+    """The campaign, and the twin that it aligns, if it does."""
+    store, config, clock = start.store, start.config, SystemClock()
+    if start.twin is None:
+        return stack.enter_context(open_sky_campaign(store, config, wishes, clock, switch, view)), None
+    settings, seed = start.twin
+    opened = stack.enter_context(open_twin_campaign(store, config, settings, seed, wishes, clock, switch, view))
+    return opened.campaign, opened.twin
 
 
 def _has_ended(store: CampaignStore, console: Console) -> bool:

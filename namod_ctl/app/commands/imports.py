@@ -44,7 +44,9 @@ ForceOption = Annotated[
 
 @app.command("maps")
 def maps(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with files such as mirror_ID13_response_map.csv.")],
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="Folder with files such as mirror_ID13_response_map.csv.")
+    ],
     out: OutOption,
     config: ConfigOption = "fact",
     force: ForceOption = False,

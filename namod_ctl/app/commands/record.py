@@ -16,8 +16,10 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from namod_ctl.app.bench_sky import twin_equipment
 from namod_ctl.app.build import build_instrument
 from namod_ctl.app.build_recording import build_record_settings
+from namod_ctl.app.build_sky_session import open_sky_session
 from namod_ctl.app.build_twin import build_twin, load_twin_settings, with_facet_map
 from namod_ctl.app.config import InstrumentConfig, load_config
 from namod_ctl.app.dashboard.beside import dashboard_beside
@@ -91,8 +93,13 @@ def record(
         ),
     ] = None,
     region_radius_deg: Annotated[
-        float, typer.Option(min=0.01, max=MAX_REGION_RADIUS_DEG, help="Of the directions that are to be covered.")
-    ] = 0.35,
+        float | None,
+        typer.Option(
+            min=0.01,
+            max=MAX_REGION_RADIUS_DEG,
+            help="Of the directions that are to be covered.  [default: of the config; 0.35]",
+        ),
+    ] = None,
     twin: Annotated[
         bool, typer.Option("--twin", help="Record the digital twin, in its own time, as fast as the computer can.")
     ] = False,
@@ -122,6 +129,7 @@ def record(
     _refuse_beyond("--region-radius-deg", region_radius_deg, MAX_REGION_RADIUS_DEG)
     stop = _stop_rule(records, minutes, until_uncertainty, is_replay=replay is not None)
     console = Console(stderr=True, highlight=False)
+    sky = None
     with ExitStack() as stack:
         if replay is not None:
             if twin or any(option is not None for option in (append, config, seed, every, twin_settings)):
@@ -129,24 +137,36 @@ def record(
             session = _replay(stack, replay, out, console, force=force)
             title = f"replay of {replay}"
         else:
-            session = _record_twin(stack, out, append, config, seed, twin_settings, force=force)
-            title = f"twin of {session.instrument.name}"
-            if not twin:
-                console.print(
-                    "There are no drivers for cameras yet: this records the digital twin, not a sky (--twin says so)."
-                )
+            _refuse_unclear_goal(out, append, force=force)
+            is_twin_wanted = twin or seed is not None or twin_settings is not None
+            sky = None if is_twin_wanted else open_sky_session(stack, out, append, config, force=force)
+            if sky is not None:
+                session = _Session(sky.equipment, sky.instrument, sky.config, sky.store, sky.store.path, pass_s=0.0)
+                title = session.instrument.name
+                for remark in sky.remarks:
+                    console.print(remark, markup=False, soft_wrap=True)
+            else:
+                session = _record_twin(stack, out, append, config, seed, twin_settings, force=force)
+                title = f"twin of {session.instrument.name}"
+                if not is_twin_wanted:
+                    console.print(
+                        "The config names no cameras: this records the digital twin, not a sky (--twin says so); "
+                        "cameras are named in [star_camera.device] and [reflector_camera.device]."
+                    )
         pace_s = every or 0.0
         if every is None and stop.n_records is not None:
             pace_s = session.pass_s / stop.n_records
         settings = replace(
             build_record_settings(session.config),
             keep_frames=keep_frames is KeepFrames.ALL,
-            region_radius_rad=deg_to_rad(region_radius_deg),
             pace_s=pace_s,
         )
+        if region_radius_deg is not None:
+            settings = replace(settings, region_radius_rad=deg_to_rad(region_radius_deg))
         estimator = None
         if replay is None:
-            estimator = LiveEstimator(session.store.path, session.instrument, is_waited_for=True)  # a twin can
+            is_waited_for = sky is None  # a twin can wait, a sky cannot
+            estimator = LiveEstimator(session.store.path, session.instrument, is_waited_for=is_waited_for)
             stack.callback(estimator.close)
         recorder = Recorder(session.equipment, session.instrument, session.store, settings, estimator, session.replayed)
         if dashboard:
@@ -188,6 +208,13 @@ def _angle_rad(text: str) -> float:
     return arcmin_to_rad(float(match[1])) if match[2] == "arcmin" else deg_to_rad(float(match[1]))
 
 
+def _refuse_unclear_goal(out: Path | None, append: Path | None, *, force: bool) -> None:
+    if (out is None) == (append is None):
+        raise ConfigError("say where the records go: --out for a new run, or --append RUN to go on with one")
+    if append is not None and force:
+        raise ConfigError(f"--append {append}: goes on with that run, --force would replace one; leave one of them out")
+
+
 def _record_twin(
     stack: ExitStack,
     out: Path | None,
@@ -198,10 +225,6 @@ def _record_twin(
     *,
     force: bool,
 ) -> _Session:
-    if (out is None) == (append is None):
-        raise ConfigError("say where the records go: --out for a new run, or --append RUN to go on with one")
-    if append is not None and force:
-        raise ConfigError(f"--append {append}: goes on with that run, --force would replace one; leave one of them out")
     asked = None if settings_file is None else load_twin_settings(settings_file)
     if append is not None:
         store = stack.enter_context(RunStore.open(append, read_only=False))
@@ -239,7 +262,7 @@ def _record_twin(
         store = stack.enter_context(RunStore.create(out, facet_ids, used.to_json(), source, twin.wall_clock, force))
         stack.enter_context(recording_lock(store.path))
         note_twin(store, settings, chosen)
-    equipment = Equipment(twin.star_camera, twin.reflector_camera, twin.clock, twin.wall_clock)
+    equipment = stack.enter_context(twin_equipment(used, twin))()
     return _Session(equipment, twin.instrument, used, store, store.path, twin.telescope.pass_s)
 
 

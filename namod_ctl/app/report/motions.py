@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from namod_ctl.app.build_correctors import GONIOMETER_SIGMA_RAD
 from namod_ctl.app.report.document import Chapter, Table, Text
 from namod_ctl.app.report.parts import number_text
 from namod_ctl.core.motion import MoveOutcome
@@ -15,7 +16,6 @@ from namod_ctl.optics.instrument import Instrument
 from namod_ctl.reconstruction.alignment import Alignment
 from namod_ctl.store.campaign import CampaignStore
 from namod_ctl.store.campaign_rows import AskedTurns, JournaledOrder
-from namod_ctl.twin.operator import GONIOMETER_ERROR_RAD
 
 
 def motion_chapters(store: CampaignStore, instrument: Instrument, alignments: Mapping[int, Alignment]) -> list[Chapter]:
@@ -97,7 +97,7 @@ def _checked(
         for n in (number, number + 1)
     )
     asked = {turn.facet_id: np.array(turn.turns_deg) for turn in turns if turn.is_done}
-    findings = check_turns(instrument.mounts, asked, was, is_now, GONIOMETER_ERROR_RAD)  # as the campaign itself did
+    findings = check_turns(instrument.mounts, asked, was, is_now, GONIOMETER_SIGMA_RAD)  # as the campaign itself did
     return {
         finding.facet_id: finding.sentence if finding.kind.is_mistake else finding.kind.value.replace("_", " ")
         for finding in findings

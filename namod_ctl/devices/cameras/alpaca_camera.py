@@ -108,7 +108,7 @@ class AlpacaCamera:
         try:
             self._await_frame(begin_s + asked_s, timeout_s)
             planes = self._device.image()
-            exposure_s = float(self._device.get("lastexposureduration"))
+            exposure_s = float(self._device.quantity("lastexposureduration"))
             self._refuse_changed()
         except (Refusal, AlpacaImageError, *NETWORK_ERRORS) as error:
             if self._is_closing.is_set():
@@ -169,7 +169,7 @@ class AlpacaCamera:
             return
         if self._setup.can_abort:
             self._device.put("abortexposure")
-        elif int(self._device.get("camerastate")) != _IDLE:
+        elif self._device.quantity("camerastate") != _IDLE:
             raise DeviceFaultError(
                 f"{self.name} exposes and cannot be stopped (CanAbortExposure is false): wait for it"
             )
@@ -180,18 +180,18 @@ class AlpacaCamera:
         """Return when the server has the frame.
 
         Servers are about that finish an exposure although it was aborted: a frame that is ready before its time is
-        such a one, and is taken out of the way.
+        such a one, and is taken out of the way. One that comes later than the new exposure's end cannot be told.
         """
         look_s = end_s if self._given_up_until_s < self._clock.monotonic_s() else min(end_s, self._given_up_until_s)
         self._wait(look_s - self._clock.monotonic_s())
         while True:
             now_s = self._clock.monotonic_s()
-            is_ready = bool(self._device.get("imageready"))
+            is_ready = self._device.flag("imageready")
             if is_ready and now_s >= end_s:
                 return
             if is_ready:
                 self._device.image()
-            elif int(self._device.get("camerastate")) == _FAILED:
+            elif self._device.quantity("camerastate") == _FAILED:
                 raise AlpacaImageError("the server reports that the exposure failed")
             if now_s >= end_s + timeout_s:
                 raise AlpacaImageError(f"no frame within {timeout_s:g} s of the exposure's end")
@@ -223,7 +223,7 @@ class AlpacaCamera:
 
 
 def list_cameras() -> list[FoundCamera]:
-    """The cameras of the Alpaca servers that answer in this computer's networks; takes about a second for each network.
+    """The cameras of the Alpaca servers that answer in this computer's networks; takes two seconds for each network.
 
     Raises
     ------

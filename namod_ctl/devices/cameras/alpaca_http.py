@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import http.client
 import json
+import math
 import random
 import socket
 import struct
@@ -26,13 +27,13 @@ from numpy.typing import NDArray
 NOT_IMPLEMENTED: Final = 0x400
 NOT_CONNECTED: Final = 0x407
 
-REQUEST_TIMEOUT_S: Final = 5.0
-IMAGE_TIMEOUT_S: Final = 10.0  # without a byte
+REQUEST_TIMEOUT_S: Final = 5.0  # without a byte
+NETWORK_ERRORS: Final = (OSError, http.client.HTTPException)
+"""What a request raises whose answer does not come."""
+
 _MEDIA_TYPE = "application/imagebytes"
 _HEADER = struct.Struct("<11i")  # ImageBytes version 1
 _ELEMENT_TYPES = {1: "<i2", 2: "<i4", 3: "<f8", 4: "<f4", 5: "<u8", 6: "<u1", 7: "<i8", 8: "<u2", 9: "<u4"}
-NETWORK_ERRORS: Final = (OSError, http.client.HTTPException)
-"""What a request raises whose answer does not come."""
 _N_IDS = 65536
 _MAX_BYTES = 1 << 30  # no camera sends more; a header that says so is damaged
 _GONE = (http.client.RemoteDisconnected, ConnectionResetError, BrokenPipeError)
@@ -92,6 +93,20 @@ class AlpacaDevice:
         """The property's value as JSON has it. Raises AlpacaRefusalError."""
         return self._request("GET", f"/api/v1/{self._kind}/{self.number}/{name}", _value_of)
 
+    def quantity(self, name: str) -> float:
+        """A property that is a number. Raises AlpacaRefusalError, HTTPException for another value."""
+        value = self.get(name)
+        if not isinstance(value, int | float) or not math.isfinite(value):
+            raise http.client.HTTPException(f"{name} = {value!r} is no number")
+        return value
+
+    def flag(self, name: str) -> bool:
+        """A property that is true or false. Raises AlpacaRefusalError, HTTPException for another value."""
+        value = self.get(name)
+        if not isinstance(value, bool):
+            raise http.client.HTTPException(f"{name} = {value!r} is neither true nor false")
+        return value
+
     def put(self, name: str, timeout_s: float = REQUEST_TIMEOUT_S, **values: str | float | bool) -> None:
         """Set a property or call a method. Raises AlpacaRefusalError."""
         self._request(
@@ -104,7 +119,9 @@ class AlpacaDevice:
 
     def configured_devices(self) -> list[dict[str, Any]]:
         """The devices of the server; DeviceName, DeviceType, DeviceNumber and UniqueID of each."""
-        return list(self._request("GET", "/management/v1/configureddevices", _value_of) or [])
+        value = self._request("GET", "/management/v1/configureddevices", _value_of)
+        devices = value if isinstance(value, list) else []
+        return [each for each in devices if isinstance(each, dict) and isinstance(each.get("DeviceNumber"), int)]
 
     def image(self) -> NDArray[Any]:
         """The last image as the device sends it: shape (columns, rows) or (columns, rows, 3) red-green-blue.
@@ -116,7 +133,7 @@ class AlpacaDevice:
         AlpacaImageError
             It is incomplete, or its header makes no sense.
         """
-        return self._request("GET", f"/api/v1/{self._kind}/{self.number}/imagearray", _image_in, IMAGE_TIMEOUT_S)
+        return self._request("GET", f"/api/v1/{self._kind}/{self.number}/imagearray", _image_in)
 
     def interrupt(self) -> None:
         """End a running request, and refuse those to come."""
@@ -196,8 +213,9 @@ def _value_of(response: http.client.HTTPResponse) -> Any:
         raise http.client.HTTPException(f"the answer is no JSON: {error}") from error
     if not isinstance(answer, dict):
         raise http.client.HTTPException("the answer is no JSON object")
-    if answer.get("ErrorNumber"):
-        raise AlpacaRefusalError(int(answer["ErrorNumber"]), str(answer.get("ErrorMessage", "")))
+    number = answer.get("ErrorNumber", 0)
+    if number != 0:
+        raise AlpacaRefusalError(number if isinstance(number, int) else -1, str(answer.get("ErrorMessage", "")))
     return answer.get("Value")
 
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from namod_ctl.core.errors import ConfigError, DeviceFaultError
 from namod_ctl.devices.cameras.alpaca_http import NOT_IMPLEMENTED, AlpacaDevice, AlpacaRefusalError
 from namod_ctl.devices.cameras.settings import CameraSettings
 
 _CONNECT_TIMEOUT_S: Final = 15.0  # cameras with coolers take their time
+_MOST_ADU: Final = 65535.0  # of a frame
+Value = TypeVar("Value")
 _GREY, _COLOUR, _RGGB = 0, 1, 2  # ASCOM's SensorType
 _TILES = {(0, 0): "RG", (1, 0): "GR", (0, 1): "GB", (1, 1): "BG"}  # by the first pixel's place in the pattern
 
@@ -108,7 +111,7 @@ def set_up(device: AlpacaDevice, settings: CameraSettings, who: str) -> AlpacaSe
     """
     try:
         device.put("connected", _CONNECT_TIMEOUT_S, Connected=True)
-        if not device.get("connected"):
+        if not device.flag("connected"):
             raise DeviceFaultError(f"{who}: it was told to connect to its camera and did not: is it plugged in?")
         return _set_up_connected(device, settings, who)
     except AlpacaRefusalError as error:
@@ -118,14 +121,14 @@ def set_up(device: AlpacaDevice, settings: CameraSettings, who: str) -> AlpacaSe
 def _set_up_connected(device: AlpacaDevice, settings: CameraSettings, who: str) -> AlpacaSetup:
     if settings.pixel_format is not None:
         raise ConfigError(f'{who}: pixel_format = "{settings.pixel_format}": Alpaca knows none; leave it out')
-    max_adu = float(device.get("maxadu"))
-    if max_adu != settings.full_scale_adu:
+    max_adu = device.quantity("maxadu")
+    if max_adu - settings.full_scale_adu not in (0.0, 1.0):  # 1: some say how many values there are
         raise ConfigError(
             f"{who}: full_scale_adu = {settings.full_scale_adu:g}, but its MaxADU is {max_adu:g}; "
-            f"set full_scale_adu = {max_adu:g}"
+            f"set full_scale_adu = {min(max_adu, _MOST_ADU):g}"
         )
     binning = settings.binning
-    most = min(int(device.get("maxbinx")), int(device.get("maxbiny")))
+    most = int(min(device.quantity("maxbinx"), device.quantity("maxbiny")))
     if binning > most:
         raise ConfigError(f"{who}: binning = {binning}, but it bins at most {most}; choose less")
     offset_x, offset_y = _offset(device, settings, who)
@@ -136,8 +139,8 @@ def _set_up_connected(device: AlpacaDevice, settings: CameraSettings, who: str) 
     gain = _fix_gain(device, settings, who)
     return AlpacaSetup(
         model=str(device.get("name")),
-        exposure_range_s=(float(device.get("exposuremin")), float(device.get("exposuremax"))),
-        can_abort=bool(device.get("canabortexposure")),
+        exposure_range_s=(float(device.quantity("exposuremin")), float(device.quantity("exposuremax"))),
+        can_abort=device.flag("canabortexposure"),
         tile=_tile(device, settings, (offset_x, offset_y), who),
         values=values if gain is None else values | {"Gain": gain},
     )
@@ -145,8 +148,8 @@ def _set_up_connected(device: AlpacaDevice, settings: CameraSettings, who: str) 
 
 def _offset(device: AlpacaDevice, settings: CameraSettings, who: str) -> tuple[int, int]:
     """The frame's upper left corner, in binned pixels."""
-    columns = int(device.get("cameraxsize")) // settings.binning
-    rows = int(device.get("cameraysize")) // settings.binning
+    columns = int(device.quantity("cameraxsize")) // settings.binning
+    rows = int(device.quantity("cameraysize")) // settings.binning
     if settings.offset_px is None:
         offset = ((columns - settings.columns) // 2, (rows - settings.rows) // 2)
     else:
@@ -164,9 +167,9 @@ def _fix_gain(device: AlpacaDevice, settings: CameraSettings, who: str) -> int |
     asked = None if settings.gain is None else round(settings.gain)
     if settings.gain is not None and asked != settings.gain:
         raise ConfigError(f"{who}: gain = {settings.gain:g}: the gains of Alpaca cameras are whole numbers")
-    lowest = _optional(device, "gainmin")
-    if lowest is None and _optional(device, "gains"):
-        lowest = 0  # the number of the first in its list
+    lowest = _optional(device.quantity, "gainmin")
+    if lowest is None and _optional(device.get, "gains"):
+        lowest = 0.0  # the number of the first in its list
     if lowest is None:
         if asked is not None:
             raise ConfigError(f"{who}: gain = {asked}, but this camera's gain cannot be set; leave it out")
@@ -178,15 +181,15 @@ def _fix_gain(device: AlpacaDevice, settings: CameraSettings, who: str) -> int |
 
 def _tile(device: AlpacaDevice, settings: CameraSettings, offset: tuple[int, int], who: str) -> str | None:
     """The Bayer pattern of the frame from its first pixel on; None when it has none."""
-    sensor = _optional(device, "sensortype") or _GREY
+    sensor = _optional(device.quantity, "sensortype") or _GREY
     if sensor in (_GREY, _COLOUR):
         return None
     if sensor != _RGGB:
         raise ConfigError(f"{who}: its SensorType {sensor} (a mosaic other than red-green-green-blue) cannot be read")
     if settings.binning > 1:
         raise ConfigError(f"{who}: binning = {settings.binning} mixes the colours of its Bayer sensor; set binning = 1")
-    place_x = (int(device.get("bayeroffsetx")) + offset[0]) % 2
-    place_y = (int(device.get("bayeroffsety")) + offset[1]) % 2
+    place_x = (int(device.quantity("bayeroffsetx")) + offset[0]) % 2
+    place_y = (int(device.quantity("bayeroffsety")) + offset[1]) % 2
     return _TILES[place_x, place_y]
 
 
@@ -200,10 +203,10 @@ def _set(device: AlpacaDevice, name: str, value: int, who: str) -> None:
         raise ConfigError(f"{who}: {name} = {value} was set, but it stays at {present}")
 
 
-def _optional(device: AlpacaDevice, name: str) -> Any:
+def _optional(ask: Callable[[str], Value], name: str) -> Value | None:
     """The property's value; None when the device does not have it."""
     try:
-        return device.get(name)
+        return ask(name)
     except AlpacaRefusalError as error:
         if error.number == NOT_IMPLEMENTED:
             return None

@@ -46,6 +46,7 @@ from namod_ctl.devices.cameras.frame_files import (
     UnfinishedFileError,
     read_frame_file,
 )
+from namod_ctl.devices.cameras.new_files import NewFiles
 from namod_ctl.devices.cameras.pixel_formats import image_of
 from namod_ctl.devices.cameras.settings import CameraSettings
 
@@ -53,18 +54,12 @@ REQUEST_FILE = "request.json"
 MANIFEST_FILE = "camera.json"
 REQUEST_SCHEMA = "namod-exposure-request/1"
 
-SETTLED_S = 0.03
-"""A file that has not changed for so long is taken for written; whether it is whole, its content says."""
-
 LOOK_EVERY_S = 0.01
-MAX_LOOKING_SHARE = 0.2
-"""Of the time may go into looking at the folder: one with thousands of old frames is looked at less often."""
 
 CLOCK_SLACK_S = 0.1
 """So far the other program's clock may be from ours before its times are taken for wrong."""
-
-Stamp = tuple[int, int, int]
-"""Inode, size and time of change: all that tells a file from what stood under its name before."""
+FRESH_SLACK_S = 0.02
+"""The same where only the times tell a new frame from an old one: clocks kept by NTP are closer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,11 +100,13 @@ class FolderCamera:
                 f"{settings.serial_number}"
             )
         self._name = f"{settings.role} camera ({manifest.get('model') or 'frames'} in {self._folder})"
+        try:
+            self._files = NewFiles(self._folder, _is_frame)
+        except OSError as error:
+            raise self._lose(error) from None
         self._session = uuid.uuid4().hex[:8]  # so that frames for another program's requests are none of ours
         self._n_starts = 0
         self._request: _Request | None = None
-        self._old: dict[str, Stamp] = {}
-        self._unsettled: set[str] = set()
         self._is_lost = False
         self._wake = threading.Condition()
         self._is_closed = False
@@ -133,12 +130,8 @@ class FolderCamera:
                 f"{self._name}: an exposure of {exposure_s:g} s was asked for; it makes {shortest_s:g} to "
                 f"{longest_s:g} s"
             )
-        stamps = self._look()
-        now_ns = SystemClock().now().timestamp() * 1e9
         with self._wake:
-            self._old = stamps
-            # one that is being written now is of an exposure that ended before this one
-            self._unsettled = {name for name, stamp in stamps.items() if now_ns - stamp[2] < SETTLED_S * 1e9}
+            self._refuse_when_gone()
             self._n_starts += 1
             name = f"{self._session}-{self._n_starts}"
             self._request = _Request(name, self._n_starts, exposure_s, self._clock.monotonic_s())
@@ -152,12 +145,10 @@ class FolderCamera:
         if request is None:
             raise CommunicationError(f"{self._name}: no exposure was begun; start one before fetching it")
         end_s = request.start_s + request.exposure_s + timeout_s
-        watched: dict[str, tuple[Stamp, float]] = {}  # and since when it has been as it is
         reasons: dict[str, str] = {}
         try:
             while True:
-                began_s = self._clock.monotonic_s()
-                exposure = self._answer(request, watched, reasons)
+                exposure = self._answer(request, reasons)
                 if exposure is not None:
                     return exposure
                 now_s = self._clock.monotonic_s()
@@ -166,9 +157,8 @@ class FolderCamera:
                     raise CommunicationError(
                         f"{self._name}: no frame within {timeout_s:g} s of the exposure's end: {why}"
                     )
-                pause_s = max(LOOK_EVERY_S, (now_s - began_s) / MAX_LOOKING_SHARE)
                 with self._wake:
-                    if self._wake.wait_for(lambda: self._request is not request, min(pause_s, end_s - now_s)):
+                    if self._wake.wait_for(lambda: self._request is not request, min(LOOK_EVERY_S, end_s - now_s)):
                         raise CommunicationError(f"{self._name}: the exposure was given up")
         finally:
             with self._wake:
@@ -191,58 +181,33 @@ class FolderCamera:
         if self._is_lost:
             raise DeviceFaultError(f"{self._name}: the folder is gone; bring it back, then open the camera again")
 
-    def _look(self) -> dict[str, Stamp]:
-        """All files that may be frames. Raises DeviceFaultError."""
-        stamps: dict[str, Stamp] = {}
-        try:
-            with os.scandir(self._folder) as entries:
-                for entry in entries:
-                    if not entry.name.startswith(".") and _ending(entry.name) in FITS_ENDINGS | PICTURE_ENDINGS:
-                        try:
-                            status = entry.stat()
-                        except FileNotFoundError:
-                            continue  # gone between two looks
-                        stamps[entry.name] = (status.st_ino, status.st_size, status.st_mtime_ns)
-        except OSError as error:
-            self._is_lost = True
-            raise DeviceFaultError(f"{self._name}: the folder is gone or cannot be read ({error.strerror})") from None
-        return stamps
+    def _lose(self, error: OSError) -> DeviceFaultError:
+        self._is_lost = True
+        return DeviceFaultError(f"{self._name}: the folder is gone or cannot be read ({error.strerror})")
 
-    def _answer(
-        self, request: _Request, watched: dict[str, tuple[Stamp, float]], reasons: dict[str, str]
-    ) -> Exposure | None:
+    def _answer(self, request: _Request, reasons: dict[str, str]) -> Exposure | None:
         """The frame that answers the request, if it is there now; `reasons` is told, by file, why others are none.
 
-        Raises CommunicationError for a frame that answers but cannot be used.
+        Raises CommunicationError for a frame that answers but cannot be used, DeviceFaultError.
         """
-        stamps = self._look()
-        now_s = self._clock.monotonic_s()
-        for name, stamp in sorted(stamps.items(), key=lambda item: item[1][2]):
-            if self._old.get(name) == stamp and name not in self._unsettled:
-                continue
-            if watched.get(name, (None, 0.0))[0] != stamp:
-                watched[name] = (stamp, now_s)
-            if now_s - watched[name][1] < SETTLED_S:
-                continue
-            if name in self._unsettled:
-                self._unsettled.discard(name)
-                self._old[name] = stamp
-                continue
+        try:
+            settled = self._files.settled(self._clock.monotonic_s())
+        except OSError as error:
+            raise self._lose(error) from None
+        for name, arrived_s in settled:
             try:
                 frame = read_frame_file(self._folder / name)
             except UnfinishedFileError as problem:
                 reasons[name] = str(problem)
                 continue
-            except FileNotFoundError:
-                continue
             except OSError as error:
                 reasons[name] = f"{name}: cannot be read ({error.strerror})"
                 continue
-            except CommunicationError:
-                self._old[name] = stamp
-                raise
-            self._old[name] = stamp
-            middle_s = self._middle_s(request, frame, watched[name][1], name, reasons)
+            except CommunicationError as problem:
+                self._files.dismiss(name)
+                raise CommunicationError(f"{self._name}: {problem}") from None
+            self._files.dismiss(name)
+            middle_s = self._middle_s(request, frame, arrived_s, name, reasons)
             if middle_s is not None:
                 return self._checked(request, frame, middle_s, name)
         return None
@@ -261,11 +226,10 @@ class FolderCamera:
             if start_s + frame.exposure_s > arrived_s + CLOCK_SLACK_S:
                 reasons[name] = f"{name} says that it was exposed after it came: set the clocks of both computers"
                 return None
-        earliest_s = request.start_s - (CLOCK_SLACK_S if frame.request is not None else 0.0)
-        if start_s < earliest_s:
-            reasons[name] = f"{name} began {request.start_s - start_s:.3g} s before it was asked for" + (
-                ": set the clocks of both computers" if frame.request is not None else ""
-            )
+        slack_s = 0.0 if frame.start is None else CLOCK_SLACK_S if frame.request is not None else FRESH_SLACK_S
+        if start_s < request.start_s - slack_s:
+            hint = "" if frame.start is None else ": set the clocks of both computers"
+            reasons[name] = f"{name} began {request.start_s - start_s:.3g} s before it was asked for{hint}"
             return None
         return start_s + frame.exposure_s / 2.0
 
@@ -300,7 +264,10 @@ class FolderCamera:
         new = self._folder / f".{REQUEST_FILE}.{self._session}"
         try:
             new.write_text(json.dumps(told) + "\n", encoding="utf-8")
+            self._files.begin(new)
             new.replace(self._folder / REQUEST_FILE)
+        except FileNotFoundError as error:
+            raise self._lose(error) from None
         except OSError as error:
             self._is_lost = True
             raise DeviceFaultError(
@@ -319,8 +286,8 @@ def list_cameras() -> list[FoundCamera]:
     return []
 
 
-def _ending(name: str) -> str:
-    return os.path.splitext(name)[1].lower()
+def _is_frame(name: str) -> bool:
+    return not name.startswith(".") and os.path.splitext(name)[1].lower() in FITS_ENDINGS | PICTURE_ENDINGS
 
 
 def _read_manifest(path: Path) -> dict[str, Any]:

@@ -73,11 +73,10 @@ def read_frame_file(path: Path) -> FrameFile:
     OSError
         It cannot be read.
     """
-    data = path.read_bytes()
     if path.suffix.lower() in FITS_ENDINGS:
-        return _read_fits(data, path)
+        return _read_fits(path.read_bytes(), path)
     facts = _side_facts(path)
-    image = _read_picture(data, path)
+    image = _read_picture(path.read_bytes(), path)
     return _frame(image, facts.get("exposure_s"), facts.get("start_utc"), facts.get("request"), path, "exposure_s")
 
 
@@ -108,28 +107,39 @@ def _moment(text: Any) -> datetime | None:
 
 
 def _read_fits(data: bytes, path: Path) -> FrameFile:
-    """The image of a FITS file's primary part."""
+    """The image of a FITS file's primary part: BITPIX = 8, or 16 with BZERO = 0 or 32768 (FITS 4.0, section 5.2.5)."""
     from astropy.io import fits  # takes half a second: only who has such files waits for it
 
     n_header = _fits_header_size(data, path)
     try:
         header = fits.Header.fromstring(data[:n_header].decode("ascii"))
-        axes = [int(header[f"NAXIS{number}"]) for number in range(1, int(header["NAXIS"]) + 1)]
-        n_bytes = abs(int(header["BITPIX"])) // 8 * math.prod(axes)
-    except (KeyError, ValueError, TypeError, UnicodeDecodeError, fits.VerifyError) as error:
-        raise CommunicationError(f"{path}: no FITS header: {error}") from None
-    if not axes or not n_bytes:
+        kind = (int(header["BITPIX"]), float(header.get("BZERO", 0.0)), float(header.get("BSCALE", 1.0)))
+        axes = [int(header[f"NAXIS{number}"]) for number in range(int(header["NAXIS"]), 0, -1)]
+        exposure = next((header[key] for key in EXPOSURE_KEYWORDS if key in header), None)
+        start = next((header[key] for key in START_KEYWORDS if key in header), None)
+        request = header.get(REQUEST_KEYWORD)
+    except (KeyError, ValueError, TypeError, fits.VerifyError) as error:
+        raise CommunicationError(f"{path}: its FITS header is not to be understood: {error}") from None
+    if not axes or min(axes) < 1:
         raise CommunicationError(f"{path}: holds no image in its first part; write it there, not compressed")
+    if kind not in ((8, 0.0, 1.0), (16, 0.0, 1.0), (16, 32768.0, 1.0)):
+        raise CommunicationError(
+            f"{path}: BITPIX = {kind[0]}, BZERO = {kind[1]:g}, BSCALE = {kind[2]:g}; write unsigned integers of 8 or 16 bit"
+        )
+    n_bytes = kind[0] // 8 * math.prod(axes)
     if len(data) < n_header + n_bytes:
         raise UnfinishedFileError(f"{path.name}: {len(data)} bytes of {n_header + n_bytes}")
-    with fits.open(io.BytesIO(data + bytes(-len(data) % _FITS_BLOCK)), memmap=False) as parts:
-        image = np.asarray(parts[0].data)
-    exposure = next((header[key] for key in EXPOSURE_KEYWORDS if key in header), None)
-    start = next((header[key] for key in START_KEYWORDS if key in header), None)
-    image = _as_unsigned(image)
+    image: NDArray[Any] = np.frombuffer(data, np.uint8 if kind[0] == 8 else ">u2", math.prod(axes), n_header)
+    if kind[0] == 16:
+        image = image.astype(np.uint16)
+        if kind[1]:
+            image ^= 0x8000  # which adds 32768 to the signed number that is written
+        elif image.max() > np.iinfo(np.int16).max:
+            raise CommunicationError(f"{path}: has negative pixels; write unsigned integers (BZERO = 32768)")
+    image = image.reshape(axes)
     if image.ndim == 3 and image.shape[0] == 3:  # one plane per colour: red, green, blue
         image = np.ascontiguousarray(image[::-1].transpose(1, 2, 0))
-    return _frame(image, exposure, start, header.get(REQUEST_KEYWORD), path, " or ".join(EXPOSURE_KEYWORDS))
+    return _frame(image, exposure, start, request, path, " or ".join(EXPOSURE_KEYWORDS))
 
 
 def _fits_header_size(data: bytes, path: Path) -> int:
@@ -144,13 +154,6 @@ def _fits_header_size(data: bytes, path: Path) -> int:
     if len(data) >= _MAX_HEADER_BYTES:
         raise CommunicationError(f"{path}: is no FITS file: its header has no end")
     raise UnfinishedFileError(f"{path.name}: its header is not whole")
-
-
-def _as_unsigned(image: NDArray[Any]) -> NDArray[Any]:
-    """Native unsigned integers; signed ones of 16 bit that are never negative as well; others as they are."""
-    if image.dtype.kind == "i" and image.dtype.itemsize == 2 and image.size and image.min() >= 0:
-        return image.astype(np.uint16)
-    return image.astype(image.dtype.newbyteorder("="), copy=False)
 
 
 def _side_facts(path: Path) -> dict[str, Any]:
@@ -197,6 +200,8 @@ def _read_picture(data: bytes, path: Path) -> NDArray[Any]:
                 picture.verify()  # the check sums; OpenCV is content with less
         elif _tiff_size(data) > len(data):
             raise UnfinishedFileError(f"{path.name}: {len(data)} bytes of {_tiff_size(data)}")
+    except PillowImage.DecompressionBombError as error:
+        raise CommunicationError(f"{path}: {error}") from None
     except (OSError, SyntaxError, ValueError, EOFError, struct.error) as error:
         raise UnfinishedFileError(f"{path.name}: is no picture, or not whole ({error})") from None
     try:

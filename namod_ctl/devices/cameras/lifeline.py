@@ -23,6 +23,9 @@ the camera is not reset any more, as that may disturb its neighbours."""
 LOOK_EVERY_S = 30.0
 """After the attempts: somebody may have put the plug in again. Looking disturbs nobody."""
 
+FORGIVEN_AFTER_S = 60.0
+"""A camera that has worked so long is worth as many attempts as before; one that comes and goes is not."""
+
 MAX_SILENCES = 5
 """Exposures in a row of which no frame came: a camera that drops some frames is there, one that drops all is not."""
 
@@ -58,7 +61,7 @@ class Lifeline:
         self._next_attempt_s = 0.0
         self._last_detail = self._reset_detail = ""
         self._id_shift = self._last_id = 0
-        self._is_new = False
+        self._is_new, self._opened_s = False, clock.monotonic_s()
 
     @property
     def name(self) -> str:
@@ -114,7 +117,9 @@ class Lifeline:
         if self._is_new:
             self._id_shift = self._last_id + 1 - exposure.frame_id
         self._is_new = False
-        self._n_silences = self._n_attempts = self._n_resets = 0  # it works again: what was before is over
+        self._n_silences = 0
+        if self._clock.monotonic_s() - self._opened_s >= FORGIVEN_AFTER_S:
+            self._n_attempts = self._n_resets = 0
         self._last_id = exposure.frame_id + self._id_shift
         return replace(exposure, frame_id=self._last_id)
 
@@ -148,7 +153,7 @@ class Lifeline:
                 raise DeviceFaultError(self._closed_text())
             self._camera = camera
         self._range_s = camera.exposure_range_s
-        self._is_new = True
+        self._is_new, self._opened_s = True, self._clock.monotonic_s()
         self._n_silences = 0
         self.n_recoveries += 1
         return camera
@@ -160,7 +165,7 @@ class Lifeline:
                 return DeviceFaultError(self._closed_text())
             camera, self._camera = self._camera, None
         self._cause = cause
-        if self._n_attempts == 0:
+        if not self._is_new:
             self._lost_s = self._clock.monotonic_s()
         if camera is not None:
             with suppress(NamodError):  # it is lost: that it cannot be closed is no news

@@ -2,6 +2,9 @@
 
 A frame is given out when its exposure is over and not before, as real cameras do: the emulated ones of the library
 (environment variable `PYLON_CAMEMU`) deliver at once, whatever the exposure.
+
+The library's calls that wait for several things at once, with a timeout, end by SIGALRM (26.9 on Linux): where anything
+else in the program handles that signal they wait for ever. Here they are called only when there is nothing to wait for.
 """
 
 from __future__ import annotations
@@ -27,6 +30,9 @@ from namod_ctl.devices.cameras.settings import CameraSettings
 
 READY_S = 0.5
 """A camera takes the next trigger some ms after its frame has come; one that does not within this is busy."""
+POLL_S = 0.001
+LOOK_UP_S = 0.1
+"""While a frame is waited for: so often we look whether the camera is being closed, or gone."""
 N_BUFFERS = 3
 """Frames that the library keeps memory for; one is used at a time."""
 MAX_TRIGGER_DELAY_S = 0.1
@@ -147,7 +153,8 @@ class PylonCamera:
                 raise CommunicationError(f"{self._name}: no exposure was begun; start one before fetching it")
             if math.isnan(running.start_s):
                 raise CommunicationError(f"{self._name}: was still busy with the frame before; try again")
-            result = self._retrieved(running, timeout_s)
+            with self._losing("does not give its frame"):
+                result = self._retrieved(running, timeout_s)
             self._is_idle = True
             try:
                 self._count(int(result.GetBlockID()))
@@ -166,9 +173,7 @@ class PylonCamera:
 
     def close(self) -> None:
         """Abort what is exposed or waited for, and let go of the camera."""
-        self._is_closing.set()
-        with suppress(self._genicam.GenericException):
-            self.device.StopGrabbing()  # ends a `fetch` that waits in another thread
+        self._is_closing.set()  # ends a `fetch` that waits in another thread
         with self._lock, suppress(self._genicam.GenericException):
             self._trouble = self._trouble or f"{self._name}: is closed; open it again"
             self.device.Close()
@@ -260,32 +265,36 @@ class PylonCamera:
 
     def _trigger(self) -> float:
         """Trigger an exposure; its start on our clock, nan when the camera was not ready for it."""
-        if self.device.CanWaitForFrameTriggerReady():
-            return_on_timeout = self._pylon.TimeoutHandling_Return
-            if not self.device.WaitForFrameTriggerReady(int(s_to_ms(READY_S)), return_on_timeout):
+        deadline_s = self._clock.monotonic_s() + READY_S
+        while self.device.CanWaitForFrameTriggerReady() and not self._is_ready():
+            if self._is_closing.wait(POLL_S) or self._clock.monotonic_s() > deadline_s:
                 return math.nan
         self._times.compare()
         before_s = self._clock.monotonic_s()
         self._software_trigger.Execute()
         return (before_s + self._clock.monotonic_s()) / 2.0
 
+    def _is_ready(self) -> bool:
+        return bool(self.device.WaitForFrameTriggerReady(0, self._pylon.TimeoutHandling_Return))
+
     def _retrieved(self, running: _Running, timeout_s: float) -> Any:
         """The library's frame, to be released."""
-        left_s = running.start_s + running.exposure_s - self._clock.monotonic_s()
-        result = None
-        if not self._is_closing.wait(max(left_s, 0.0)):
-            try:
-                result = self.device.RetrieveResult(int(s_to_ms(timeout_s)), self._pylon.TimeoutHandling_Return)
-            except self._genicam.GenericException as error:
-                if not self._is_closing.is_set():
-                    self._refuse_removed()
-                    raise CommunicationError(f"{self._name}: {error.GetDescription()}; try again") from None
-        if self._is_closing.is_set():
-            raise CommunicationError(f"{self._name}: was closed while a frame was waited for")
-        if result is None or not result.IsValid():
+        end_s = running.start_s + running.exposure_s
+        left_s = end_s - self._clock.monotonic_s()
+        self._is_closing.wait(max(left_s, 0.0))
+        arrival = self.device.GetGrabResultWaitObject()
+        while not self._is_closing.is_set():
+            left_s = end_s + timeout_s - self._clock.monotonic_s()
+            if arrival.Wait(int(s_to_ms(min(max(left_s, 0.0), LOOK_UP_S)))):
+                result = self.device.RetrieveResult(0, self._pylon.TimeoutHandling_Return)
+                if result.IsValid():
+                    return result
             self._refuse_removed()
-            raise CommunicationError(f"{self._name}: no frame within {timeout_s:g} s of the exposure's end; try again")
-        return result
+            if left_s <= 0.0:
+                raise CommunicationError(
+                    f"{self._name}: no frame within {timeout_s:g} s of the exposure's end; try again"
+                )
+        raise CommunicationError(f"{self._name}: was closed while a frame was waited for")
 
     def _image(self, result: Any) -> Image:
         """The frame's pixels in memory of their own: copied once, or not at all where they are converted anyway."""

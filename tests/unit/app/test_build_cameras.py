@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -192,3 +194,18 @@ def test_without_devices_there_is_no_session_under_the_sky(read: Write, tmp_path
     with ExitStack() as stack:
         assert open_sky_session(stack, tmp_path / "run", None, "fact", force=False) is None
     assert not (tmp_path / "run").exists()
+
+
+def test_drivers_are_loaded_without_the_libraries_of_makers() -> None:
+    """Whoever has one maker's camera needs the library of none of the others."""
+    look = """
+import importlib, sys
+from namod_ctl.app.build_cameras import CAMERA_CLASSES
+for driver, name in CAMERA_CLASSES.items():
+    module = importlib.import_module(f"namod_ctl.devices.cameras.{driver}_camera")
+    assert callable(getattr(module, name)) and callable(module.list_cameras), driver
+print(sorted({"pypylon", "pyueye", "alpaca", "indipyclient", "gi"} & set(sys.modules)))
+"""
+    done = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == "[]"

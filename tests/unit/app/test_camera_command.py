@@ -231,6 +231,13 @@ def test_a_camera_by_its_driver_and_number() -> None:
     assert "640 x 480 pixel, grey, 8 bit" in done.stdout
 
 
+def test_a_camera_of_the_bench_sees_the_twins_sky_through_its_makers_library() -> None:
+    done = on_an_emulated_camera("check", "star", "--config", "bench_pylon")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "Basler Emulation" in done.stdout
+    assert "follows its exposure setting" in done.stdout
+
+
 def test_the_makers_emulated_camera_does_not_follow_its_exposure_and_is_found_out() -> None:
     """It shows a test picture that is the same at every exposure."""
     done = on_an_emulated_camera("check", "pylon:0815-0000", "--size", "640x480")

@@ -84,8 +84,9 @@ def test_bolts_lie_as_seen_from_the_side_of_the_config(side: Literal["front", "b
         np.testing.assert_allclose(legs, telescope.mounts[facet_id].legs_m * [to_right, 1.0], atol=2e-3)
 
 
-def test_order_and_words_are_those_of_the_printed_sheets() -> None:
-    telescope, alignment = night()
+@pytest.mark.parametrize("sense", ["clockwise", "counterclockwise"])
+def test_order_and_words_are_those_of_the_printed_sheets(sense: Sense) -> None:
+    telescope, alignment = night(sense)
     sheet = work_sheet(telescope, alignment, [1, 2])
     instructions = facet_instructions(alignment, telescope.goniometer_resolution_rad)
     planned = plan_sheets(telescope.reflector, [facet.facet_id for facet in alignment.facets], "back")

@@ -17,7 +17,8 @@ from namod_ctl.core.errors import CommunicationError, ConfigError, DeviceFaultEr
 from namod_ctl.core.interfaces import Exposure
 from namod_ctl.cycle import exposure_check
 from namod_ctl.cycle.exposure_check import refuse_disobedient
-from namod_ctl.cycle.exposure_growth import LEVEL_RATIO, ExposureCheck, ExposureFinding
+from namod_ctl.cycle.exposure_growth import LEVEL_RATIO, ExposureCheck, ExposureFinding, ExposureFrames, judged
+from namod_ctl.imaging.exposure import exposure_rule
 from namod_ctl.optics.camera_model import CameraModel
 
 
@@ -204,3 +205,26 @@ def test_before_a_recording_both_are_checked_and_the_bad_one_is_refused() -> Non
     told = refuse_disobedient([(dark.star, STAR, None)], dark.clock)
     assert "cannot be told" in told[0]
     assert len(dark.star.started) <= 8
+
+
+@pytest.mark.parametrize("obeys", [True, False])
+@pytest.mark.parametrize("jumps", [0.05, 0.2, 0.5])
+def test_however_the_light_jumps_nobody_is_judged_wrongly(obeys: bool, jumps: float) -> None:
+    """Frames of 60 checks each, made here: light that jumps by that share (rms of its logarithm) between frames."""
+    wrong = ExposureFinding.REFUSED if obeys else ExposureFinding.FOLLOWS
+    rule = exposure_rule(STAR, 1e-3, 3.0)
+    rng = np.random.default_rng(7)
+    levels_s = [0.01, 0.02, 0.04]
+    found = []
+    for _ in range(60):
+        frames = ExposureFrames()
+        for asked_s in (levels_s + levels_s[-2:0:-1]) * 12 + levels_s[:1]:
+            grown = asked_s / 0.04 if obeys else 1.0
+            light = 0.5 * grown**rule.response_per_exposure * math.exp(jumps * rng.normal())
+            frames.asked_s.append(asked_s)
+            frames.reported_s.append(asked_s)
+            frames.light.append(light if light < 0.98 else math.nan)
+        found.append(judged("camera", frames, levels_s, rule).verdict)
+    assert wrong not in found
+    decided = sum(finding is not ExposureFinding.UNKNOWN for finding in found)
+    assert decided == 60 if jumps == 0.05 else jumps > 0.2 or decided > 40

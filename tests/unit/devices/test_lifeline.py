@@ -11,7 +11,7 @@ from virtual_usb import VirtualUsb, basler
 
 from namod_ctl.core.errors import CommunicationError, DeviceFaultError, LimitError
 from namod_ctl.core.interfaces import Exposure
-from namod_ctl.devices.cameras.lifeline import LOOK_EVERY_S, MAX_SILENCES, RETRY_AFTER_S, Lifeline
+from namod_ctl.devices.cameras.lifeline import FORGIVEN_AFTER_S, LOOK_EVERY_S, MAX_SILENCES, RETRY_AFTER_S, Lifeline
 from namod_ctl.devices.usb_reset import CameraReset, UsbReset
 
 SERIAL = "21979447"
@@ -163,16 +163,39 @@ def test_resets_are_bounded_and_then_it_says_what_was_tried_and_what_to_do() -> 
     assert len(frames) >= 4
 
 
-def test_after_it_has_worked_again_it_is_worth_as_many_attempts_as_before() -> None:
+def test_after_it_has_worked_for_a_while_it_is_worth_as_many_attempts_as_before() -> None:
     bench = Bench()
     camera = bench.lifeline()
     for n in range(1, 5):
         bench.unplug()
         _, said = tried(camera, bench.clock, 5.0)
         assert "attempt 1 of" in said[0]
+        assert "lost 0 s ago" in said[0]
         bench.plug()
-        tried(camera, bench.clock, 10.0)
+        tried(camera, bench.clock, FORGIVEN_AFTER_S + 10.0)
         assert camera.n_recoveries == n
+
+
+def test_a_camera_that_comes_and_goes_is_not_reset_for_ever() -> None:
+    """Each time it is opened it gives one frame and is lost again."""
+    bench = Bench()
+    camera = bench.lifeline()
+    frames, said = [], []
+    healthy = BenchCamera.fetch
+
+    def fetch(self: BenchCamera, timeout_s: float) -> Exposure:
+        if self._n == 1:
+            raise DeviceFaultError("lost again")
+        return healthy(self, timeout_s)
+
+    BenchCamera.fetch = fetch  # type: ignore[method-assign]
+    try:
+        frames, said = tried(camera, bench.clock, 600.0)
+    finally:
+        BenchCamera.fetch = healthy  # type: ignore[method-assign]
+    assert bench.device.n_resets == len(RETRY_AFTER_S)
+    assert 10 < len(frames) < 60  # and whenever it can, it works
+    assert "given up" in said[-1]
 
 
 def test_a_camera_that_opens_but_never_delivers_does_not_count_as_back() -> None:

@@ -9,7 +9,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -18,7 +18,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from namod_ctl.core.errors import CommunicationError
+from namod_ctl.core.clock import SystemMonotonicClock
+from namod_ctl.core.errors import CommunicationError, ConfigError, DeviceFaultError
+from namod_ctl.devices.cameras.alpaca_camera import AlpacaCamera
 from namod_ctl.devices.cameras.alpaca_http import (
     NETWORK_ERRORS,
     AlpacaDevice,
@@ -27,6 +29,7 @@ from namod_ctl.devices.cameras.alpaca_http import (
 )
 from namod_ctl.devices.cameras.alpaca_image import image_of_alpaca
 from namod_ctl.devices.cameras.indi_image import frame_of_fits
+from namod_ctl.devices.cameras.settings import CameraSettings
 
 ELEMENT_TYPES = {1: "<i2", 2: "<i4", 3: "<f8", 4: "<f4", 6: "<u1", 8: "<u2", 9: "<u4"}
 """By their numbers in the table ImageArrayElementTypes of the Alpaca API reference."""
@@ -34,12 +37,21 @@ FEW = settings(max_examples=40, deadline=None, suppress_health_check=[HealthChec
 
 
 class _Server(BaseHTTPRequestHandler):
-    """Answers every request with `body`; of `n_sent` bytes where they are fewer than it announces."""
+    """Answers every request with `body`, or `bodies` in turn; `n_sent` bytes where they are fewer than announced."""
 
     protocol_version = "HTTP/1.1"
     body, n_sent, media_type = b"", 1 << 30, "application/imagebytes"
+    bodies: ClassVar[list[bytes]] = []
+    n_answers = 0
+
+    def do_PUT(self) -> None:
+        self.rfile.read(int(self.headers["Content-Length"]))
+        self.do_GET()
 
     def do_GET(self) -> None:
+        if self.bodies:
+            type(self).n_answers += 1
+            type(self).body = self.bodies[self.n_answers % len(self.bodies)]
         self.send_response(200)
         self.send_header("Content-Type", self.media_type)
         self.send_header("Content-Length", str(len(self.body)))
@@ -109,6 +121,30 @@ def test_an_image_that_breaks_off_is_told(port: int, sent: tuple[NDArray[Any], i
 def test_any_answer_is_an_image_or_an_error(port: int, body: bytes) -> None:
     with suppress(AlpacaImageError, AlpacaRefusalError, *NETWORK_ERRORS):
         assert received(port, body).ndim in (2, 3)
+
+
+@FEW
+@given(
+    answers=st.lists(
+        st.one_of(
+            st.none() | st.booleans() | st.integers(-1, 9) | st.floats() | st.text(max_size=3),
+            st.lists(st.integers(), max_size=2),
+        ),
+        min_size=1,
+        max_size=6,
+    ),
+    number=st.sampled_from([0, 0, 0, 0x400, 0x407, "many", None]),
+)
+def test_a_server_that_answers_anything_is_told(port: int, answers: list[object], number: object) -> None:
+    """Wrong types, no values, errors where none can be: a message for a person, never a traceback."""
+    _Server.n_sent, _Server.media_type = 1 << 30, "application/json"
+    _Server.bodies = [json.dumps({"Value": value, "ErrorNumber": number}).encode() for value in (True, *answers)]
+    settings = CameraSettings("star", "alpaca", 2, 2, 9.0, address=f"127.0.0.1:{port}", device="0")
+    try:
+        with suppress(ConfigError, DeviceFaultError):
+            AlpacaCamera(settings, SystemMonotonicClock()).close()
+    finally:
+        _Server.bodies = []
 
 
 def test_a_header_that_claims_too_much_takes_no_memory(port: int) -> None:

@@ -56,7 +56,7 @@ export const inWords = (facet) => (facet.bolts.length
   ? facet.bolts.map(({ turn, sense }, i) => `bolt ${i + 1}: ${turn}${sense ? ` ${sense}` : ""}`).join(", ")
   : facet.verdict);
 
-// the mirror with all bolts; the node of each facet by its id
+// the mirror with all bolts; the nodes of each facet by its id, and what marks the one that is chosen
 export function drawMirror(svg, facets, others, onChoice) {
   const all = [...facets, ...others].map(({ outline }) => outline);
   svg.setAttribute("viewBox", frame(all, 0.01).box);
@@ -75,8 +75,10 @@ export function drawMirror(svg, facets, others, onChoice) {
     names.push(name, tick);
     if (isLegible) facet.bolts.forEach((each, i) => bolts.push(...bolt(inward(centre, facet.legs[i], 0.7), 0.085 * width, "", each)));
   }
-  svg.replaceChildren(...parts, ...bolts, ...names);
-  return nodes;
+  const ring = drawn("polygon", { points: "", class: "chosen" }); // over its neighbours' edges
+  svg.replaceChildren(...parts, ring, ...bolts, ...names);
+  const mark = (facet) => ring.setAttribute("points", points(facet.outline));
+  return { nodes, mark };
 }
 
 export function boltLine({ turn, sense }, i) {

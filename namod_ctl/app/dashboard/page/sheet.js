@@ -15,6 +15,7 @@ let facets = []; // of the sheet, in the order of work
 let chosen = null; // facet id
 let places = new Map(); // facet id -> {node, tick} of the map and {button} of the list
 let isCampaign = true;
+let markChosen = () => {};
 
 export function setUpSheet(about) {
   isCampaign = about.kind === "campaign";
@@ -59,8 +60,9 @@ function build() {
   facets = sheet.sheets.flatMap((each) => each.facets.map((facet) => ({ ...facet, place: each.name })));
   setText(byId("sheet-side"), `${sheet.side}.`);
   setText(byId("sheet-stand"), sheet.stand);
-  const nodes = drawMirror(byId("sheet-map"), facets, sheet.others, choose);
+  const { nodes, mark } = drawMirror(byId("sheet-map"), facets, sheet.others, choose);
   setText(byId("sheet-key"), `${sheet.side}. Arrows: the way to turn, looking at the bolt. ${sheet.senses} ✓: done. Dashed: do not turn.`);
+  markChosen = mark;
   places = new Map();
   byId("sheet-list").replaceChildren(...sheet.sheets.flatMap((each) => {
     const buttons = each.facets.map((facet) => {
@@ -132,6 +134,7 @@ function show() {
   setText(byId("sheet-place"), facet.place);
   setText(byId("sheet-state"), marked.has(facet.id) ? "✓ done" : WORDS[facet.verdict]);
   byId("sheet-state").dataset.verdict = facet.verdict;
+  markChosen(facet);
   drawFacet(byId("sheet-picture"), facet);
   byId("sheet-bolts").replaceChildren(...facet.bolts.map(boltLine));
   const notes = [...facet.notes.map((note) => `Note: ${note}`), ...(facet.why ? [facet.why] : [])];
@@ -161,7 +164,7 @@ function showPlace(facet, marked) {
   const isDone = marked.has(facet.id);
   const words = isDone ? "done" : WORDS[facet.verdict];
   const kind = isDone ? "is-done" : { turn: "to-do", "do not turn": "forbidden" }[facet.verdict] ?? "as-it-is";
-  node.setAttribute("class", `mirror-edge ${kind}${facet.id === chosen ? " chosen" : ""}`);
+  node.setAttribute("class", `mirror-edge ${kind}`);
   setText(tick, isDone ? "✓" : "");
   setText(button, `${facet.id}${{ "is-done": " ✓", forbidden: " ✕", "as-it-is": " ok" }[kind] ?? ""}`);
   button.setAttribute("aria-label", `facet ${facet.id}: ${words}`);
