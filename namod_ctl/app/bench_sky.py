@@ -96,17 +96,25 @@ def twin_equipment(config: InstrumentConfig, twin: Twin) -> Iterator[Callable[[]
     """What opens the equipment of a recording on a twin, anew for each, as recordings close their cameras.
 
     The cameras are the twin's own, or where the config says `fed_by_twin` those of a maker's library. These are opened
-    again by themselves when they get lost.
+    here for a first time, so that nothing is begun with cameras that cannot be used, and again by themselves when they
+    get lost.
 
     Raises
     ------
     ConfigError
-        On opening: a camera does not take a setting, or its library is missing.
+        A camera does not take a setting, or its library is missing.
     DeviceFaultError
-        On opening: there is no such camera.
+        There is no such camera.
     """
     with TemporaryDirectory(prefix="namod_bench_") as folder:
-        yield lambda: _open(config, twin, Path(folder))
+
+        def open_equipment() -> Equipment:
+            return _open(config, twin, Path(folder))
+
+        tried = open_equipment()
+        tried.star_camera.close()
+        tried.reflector_camera.close()
+        yield open_equipment
 
 
 def show(image: NDArray[np.unsignedinteger[Any]], picture: Path, unfinished: Path) -> None:

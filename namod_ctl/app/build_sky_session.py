@@ -46,8 +46,8 @@ def open_sky_session(
     Raises
     ------
     ConfigError
-        A camera refuses a setting or ignores its exposure, the config has no outlines of the facets, something is at `out`, or `append` is of
-        another config.
+        A camera refuses a setting or ignores its exposure, the config has no outlines of the facets, something is at
+        `out`, or `append` is of another config.
     DeviceFaultError
         There is no such camera.
     """

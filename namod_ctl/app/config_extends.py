@@ -1,8 +1,8 @@
 """Configs that build on another: `extends = "fact.toml"` at the top of a file.
 
 The file's tables are laid over those of its base, key by key and table in table; everything that is no table (a list,
-too) takes the place of what the base says. A table whose `kind` differs from the base's takes its place as a whole:
-the base's keys would mean nothing in it. A base may itself extend another.
+too) takes the place of what the base says. A table whose `kind` or `driver` differs from the base's takes its place as
+a whole: the base's keys would mean nothing in it. A base may itself extend another.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from namod_ctl.core.errors import ConfigError
 from namod_ctl.store.table_text import read_text
 
 KEY = "extends"
+_KINDS = ("kind", "driver")
 
 
 def read_extended(path: Path, find_base: Callable[[str], Path]) -> tuple[dict[str, Any], str]:
@@ -63,7 +64,7 @@ def _laid_over(base: Mapping[str, Any], upper: Mapping[str, Any]) -> dict[str, A
         if (
             isinstance(value, dict)
             and isinstance(below, dict)
-            and value.get("kind", below.get("kind")) == below.get("kind")
+            and all(value.get(name, below.get(name)) == below.get(name) for name in _KINDS)
         ):
             merged[key] = _laid_over(below, value)
         else:
@@ -77,6 +78,10 @@ def _name_files_from(raw: dict[str, Any], folder: Path) -> None:
     buses = actuators.get("buses") if isinstance(actuators, dict) else None
     tables = [(raw.get("reflector"), "facets_file"), (raw.get("reflector_map"), "polygons_file")]
     tables += [(bus, "drive_map") for bus in (buses if isinstance(buses, list) else [])]
+    for camera in ("star_camera", "reflector_camera"):
+        device = raw[camera].get("device") if isinstance(raw.get(camera), dict) else None
+        if isinstance(device, dict) and device.get("driver") == "folder" and isinstance(device.get("address"), str):
+            device["address"] = str(folder / Path(device["address"]).expanduser())  # may come into being later
     for table, key in tables:
         if isinstance(table, dict) and isinstance(table.get(key), str) and (folder / table[key]).is_file():
             table[key] = str(folder / table[key])

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from namod_ctl.core.clock import Clock
-from namod_ctl.core.errors import ConfigError, NamodError, StoreError
+from namod_ctl.core.errors import NamodError, StoreError
 from namod_ctl.core.interfaces import Camera, MonotonicClock
 from namod_ctl.core.records import Record
 from namod_ctl.core.units import deg_to_rad
@@ -345,12 +345,7 @@ class Recorder:
     def _put(self, record: Record, pair: Pair) -> None:
         if self._settings.keep_frames:
             for camera, exposure in (("star_camera", pair.star), ("reflector_camera", pair.reflector)):
-                if exposure.image.dtype != np.uint8:
-                    raise ConfigError(
-                        f"{camera}: frames of type {exposure.image.dtype} cannot be kept, only of 8 bit: "
-                        "record with --keep-frames none"
-                    )
-                self._store.add_frame(record.index, camera, exposure.image.astype(np.uint8, copy=False))
+                self._store.add_frame(record.index, camera, exposure.image)
         self._store.append([record], self._live.with_record(lambda: self._status(self.progress(pair=pair))))
 
     def _note_session(self, reason: str) -> None:

@@ -21,16 +21,16 @@ from numpy.typing import NDArray
 from namod_ctl.core.errors import StoreError
 
 STAR_CAMERA, REFLECTOR_CAMERA = "star_camera", "reflector_camera"  # names under which frames are kept
-Frame = NDArray[np.uint8]
+Frame = NDArray[np.uint8] | NDArray[np.uint16]
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_LEVEL = 1
 
 
 def encode_png(frame: Frame) -> bytes:
-    """The frame, uint8 of shape (rows, columns) or (rows, columns, 3) in OpenCV's channel order, as a PNG file."""
-    if frame.dtype != np.uint8:
-        raise ValueError(f"frames are uint8, not {frame.dtype}")
+    """The frame, uint8 or uint16 of shape (rows, columns) or (rows, columns, 3) in OpenCV's order, as a PNG file."""
+    if frame.dtype not in (np.uint8, np.uint16):
+        raise ValueError(f"frames are uint8 or uint16, not {frame.dtype}")
     is_encoded, data = cv2.imencode(".png", frame, [cv2.IMWRITE_PNG_COMPRESSION, _PNG_LEVEL])
     if not is_encoded:
         raise ValueError(f"a frame of shape {frame.shape} cannot be written as PNG")
@@ -38,7 +38,7 @@ def encode_png(frame: Frame) -> bytes:
 
 
 def decode_png(data: bytes) -> Frame:
-    """The frame in a PNG file's bytes: uint8, shape (rows, columns) or (rows, columns, 3), OpenCV's channel order.
+    """The frame in a PNG file's bytes: uint8 or uint16, shape (rows, columns) or (rows, columns, 3), OpenCV's order.
 
     An alpha channel is dropped: no camera of ours writes one.
 
@@ -46,7 +46,7 @@ def decode_png(data: bytes) -> Frame:
     ------
     ValueError
         It is no PNG, it is cut or damaged (its check sums are verified here: what image libraries make of a cut
-        file differs from version to version), or it has more than 8 bits per channel.
+        file differs from version to version).
     """
     _check_png(data)
     try:
@@ -55,10 +55,10 @@ def decode_png(data: bytes) -> Frame:
         raise ValueError(f"the PNG cannot be decoded ({error.err})") from error
     if frame is None:
         raise ValueError("the PNG cannot be decoded")
-    if frame.dtype != np.uint8:
-        raise ValueError(f"the PNG has {8 * frame.dtype.itemsize} bits per channel, 8 are expected")
     if frame.ndim == 3 and frame.shape[2] == 4:
         frame = frame[:, :, :3]
+    if frame.dtype == np.uint16:
+        return np.ascontiguousarray(frame, dtype=np.uint16)
     return np.ascontiguousarray(frame, dtype=np.uint8)
 
 

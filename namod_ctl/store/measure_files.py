@@ -115,6 +115,8 @@ def _read_frame(path: Path, camera: CameraModel) -> Frame:
         frame = decode_png(path.read_bytes())
     except ValueError as error:
         raise _DamagedFileError(f"{path.name}: {error}") from error
+    if frame.dtype != np.uint8:  # the original program wrote no others: the law of its cameras would not hold
+        raise _DamagedFileError(f"{path.name}: the PNG has {8 * frame.dtype.itemsize} bits per channel, 8 are expected")
     n_rows, n_columns = frame.shape[:2]
     if (n_columns, n_rows) != (camera.n_columns, camera.n_rows):
         raise _DamagedFileError(

@@ -241,7 +241,7 @@ class RunStore:
         return [(int(index), str(label)) for index, label in rows]
 
     def add_frame(self, record_index: int, camera: str, frame: Frame) -> None:
-        """Keep a frame, uint8 of shape (rows, columns) or (rows, columns, 3) in OpenCV's channel order.
+        """Keep a frame, uint8 or uint16 of shape (rows, columns) or (rows, columns, 3) in OpenCV's channel order.
 
         Frames go before the record they belong to: once the record is committed, its frames are there.
         """

@@ -28,6 +28,7 @@ ALIGNED = 1.05
 @pytest.fixture
 def delivered(monkeypatch: pytest.MonkeyPatch) -> dict[type, list[bytes]]:
     """Fingerprints of all frames that cameras of each kind delivered."""
+    monkeypatch.setenv("PYLON_CAMEMU", "2")
     found: dict[type, list[bytes]] = defaultdict(list)
     for kind in (TwinCamera, PylonCamera):
 

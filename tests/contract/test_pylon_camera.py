@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import importlib
 import signal
 import sys
 import threading
@@ -26,7 +26,6 @@ from namod_ctl.devices.cameras.pylon_camera import PylonCamera, list_cameras
 from namod_ctl.devices.cameras.pylon_nodes import DeviceTimes, PylonNodes
 from namod_ctl.devices.cameras.settings import CameraSettings
 
-os.environ["PYLON_CAMEMU"] = "2"  # the library then has two emulated cameras
 pytest.importorskip("pypylon.pylon", reason="pypylon is not installed: pip install 'namod-ctl[pylon]'")
 
 SERIAL_NUMBERS = ("0815-0000", "0815-0001")
@@ -34,8 +33,20 @@ COLUMNS, ROWS = 384, 288
 CLOCK = SystemMonotonicClock()
 
 
+@pytest.fixture(autouse=True)
+def emulation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The library has two emulated cameras."""
+    monkeypatch.setenv("PYLON_CAMEMU", "2")
+
+
 def settings(**changed: Any) -> CameraSettings:
-    usual = {"role": "star", "driver": "pylon", "columns": COLUMNS, "rows": ROWS, "full_scale_adu": 255.0}
+    usual: dict[str, Any] = {
+        "role": "star",
+        "driver": "pylon",
+        "columns": COLUMNS,
+        "rows": ROWS,
+        "full_scale_adu": 255.0,
+    }
     return CameraSettings(**(usual | {"serial_number": SERIAL_NUMBERS[0]} | changed))
 
 
@@ -120,7 +131,7 @@ def test_pixels_are_those_that_the_camera_was_shown(
             cv2.imwrite(str(tmp_path / name), np.zeros(shape, dtype=dtype))
         camera.show_pictures(tmp_path)
         for _ in range(5):
-            shown = rng.integers(0, int(full_scale_adu) + 1, shape).astype(dtype)
+            shown: NDArray[Any] = rng.integers(0, int(full_scale_adu) + 1, shape).astype(dtype)
             for name in ("a.png", "b.png"):
                 cv2.imwrite(str(tmp_path / name), shown)
             assert np.array_equal(take(camera), shown)
@@ -212,8 +223,7 @@ class StubbornNode:
 
 
 def test_a_setting_that_is_silently_ignored_is_refused_with_both_values() -> None:
-    from pypylon import genicam
-
+    genicam = importlib.import_module("pypylon.genicam")
     names = {name: getattr(genicam, name) for name in dir(genicam) if name.endswith("Exception")}
     readable = SimpleNamespace(IsReadable=lambda node: True, IsWritable=lambda node: True, **names)
     node_map = SimpleNamespace(GetNode=lambda name: StubbornNode("Continuous"))
@@ -223,34 +233,55 @@ def test_a_setting_that_is_silently_ignored_is_refused_with_both_values() -> Non
 
 
 class TickingCamera:
-    """Nodes of a GigE camera whose clock runs at 125 MHz, `offset_s` ahead of ours."""
+    """Nodes of a camera whose clock is behind ours, of GigE Vision's kind or of GenICam SFNC 2's."""
 
-    def __init__(self, now_s: Callable[[], float], offset_s: float) -> None:
-        self.now_s, self.offset_s = now_s, offset_s
+    def __init__(self, now_s: Callable[[], float], names: tuple[str, str], ticks_per_s: int, *, says_so: bool) -> None:
+        self.now_s, self.ticks_per_s = now_s, ticks_per_s
         self.ticks = 0
+        self.nodes = {
+            names[0]: SimpleNamespace(Execute=self.latch),
+            names[1]: SimpleNamespace(GetValue=lambda: self.ticks),
+        }
+        if says_so:
+            self.nodes["GevTimestampTickFrequency"] = SimpleNamespace(GetValue=lambda: ticks_per_s)
 
     def find(self, name: str) -> Any | None:
-        return {
-            "GevTimestampControlLatch": SimpleNamespace(Execute=self.latch),
-            "GevTimestampValue": SimpleNamespace(GetValue=lambda: self.ticks),
-            "GevTimestampTickFrequency": SimpleNamespace(GetValue=lambda: 125_000_000),
-        }.get(name)
+        return self.nodes.get(name)
 
     def latch(self) -> None:
         self.ticks = self.at(self.now_s())
 
     def at(self, time_s: float) -> int:
-        return round((time_s + self.offset_s) * 125e6)
+        return round((time_s - 990.0) * self.ticks_per_s)
 
 
-def test_the_cameras_own_clock_is_brought_onto_ours() -> None:
-    now_s = 1000.0
-    clock = SimpleNamespace(monotonic_s=lambda: now_s)
-    camera = TickingCamera(clock.monotonic_s, offset_s=-990.0)
+@pytest.mark.parametrize(
+    ("names", "ticks_per_s", "says_so"),
+    [
+        (("GevTimestampControlLatch", "GevTimestampValue"), 125_000_000, True),
+        (("TimestampLatch", "TimestampLatchValue"), 1_000_000_000, False),
+    ],
+)
+def test_the_cameras_own_clock_is_brought_onto_ours(names: tuple[str, str], ticks_per_s: int, says_so: bool) -> None:
+    clock = SimpleNamespace(monotonic_s=lambda: 1000.0)
+    camera = TickingCamera(clock.monotonic_s, names, ticks_per_s, says_so=says_so)
     times = DeviceTimes(camera, clock)  # type: ignore[arg-type] # as much of a camera as it uses
     times.compare()
     assert times.host_s(camera.at(1000.25)) == pytest.approx(1000.25, abs=1e-8)
     assert np.isnan(times.host_s(0))  # a frame without a time
+
+
+@pytest.mark.parametrize(("delay_s", "is_believed"), [(0.002, True), (0.03, False), (-3000.0, False), (np.nan, False)])
+def test_a_time_stamp_is_believed_where_it_can_be_the_exposures_start(delay_s: float, is_believed: bool) -> None:
+    with opened() as camera:
+        camera.start(0.02)
+        assert camera._running is not None
+        triggered_s = camera._running.start_s
+        stamped_s = triggered_s + delay_s
+        camera._times = SimpleNamespace(host_s=lambda ticks: stamped_s)  # type: ignore[assignment]
+        exposure = camera.fetch(1.0)
+    start_s = exposure.mid_exposure_s - exposure.exposure_s / 2.0
+    assert start_s == pytest.approx(stamped_s if is_believed else triggered_s, abs=1e-9)
 
 
 # --- stopping, and frames that do not come

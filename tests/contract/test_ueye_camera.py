@@ -58,7 +58,13 @@ def stand_in(library: ctypes.CDLL) -> ctypes.CDLL:
 
 
 def settings(**changed: Any) -> CameraSettings:
-    usual = {"role": "star", "driver": "ueye", "columns": COLUMNS, "rows": ROWS, "full_scale_adu": 255.0}
+    usual: dict[str, Any] = {
+        "role": "star",
+        "driver": "ueye",
+        "columns": COLUMNS,
+        "rows": ROWS,
+        "full_scale_adu": 255.0,
+    }
     return CameraSettings(**(usual | {"serial_number": GREY} | changed))
 
 

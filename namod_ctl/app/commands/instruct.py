@@ -57,7 +57,11 @@ def instruct(
         instrument = build_instrument(InstrumentConfig.from_json(store.config_json, f"{run}: config"))
         alignment = read_alignment(run)
         _refuse_foreign_alignment(alignment, instrument, store.facet_ids, run)
-        picture = read_picture(image) if image is not None else _picture_of_run(store)
+        picture = (
+            read_picture(image)
+            if image is not None
+            else _picture_of_run(store, instrument.reflector_camera.full_scale_adu)
+        )
     folder = out if out is not None else run
     if not folder.is_dir():
         raise ConfigError(f"{folder}: this folder does not exist; make it, or leave --out out to write into {run}")
@@ -96,15 +100,17 @@ def read_picture(path: Path) -> Image:
     return np.asarray(cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
-def _picture_of_run(store: RunStore) -> Image | None:
+def _picture_of_run(store: RunStore, full_scale_adu: float) -> Image | None:
     """The run's reflector frames over each other, so that every facet appears lit; None when none were kept."""
     labels = store.labels()
     picture: Image | None = None
     for index, _ in labels[:: max(1, len(labels) // _MOST_FRAMES)]:
         try:
-            frame = store.frame(index, REFLECTOR_CAMERA)
+            kept = store.frame(index, REFLECTOR_CAMERA)
         except StoreError:
             continue  # not kept, or damaged: another frame serves as well
+        scale = 255.0 / full_scale_adu if kept.dtype == np.uint16 else 1.0
+        frame: Image = np.asarray(cv2.convertScaleAbs(kept, alpha=scale), dtype=np.uint8)
         if frame.ndim == 2:
             frame = np.repeat(frame[:, :, np.newaxis], 3, axis=2)
         if picture is None:

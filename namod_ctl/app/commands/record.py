@@ -151,7 +151,8 @@ def record(
                 if not is_twin_wanted:
                     console.print(
                         "The config names no cameras: this records the digital twin, not a sky (--twin says so); "
-                        "cameras are named in [star_camera.device] and [reflector_camera.device]."
+                        "cameras are named in [star_camera.device] and [reflector_camera.device].",
+                        markup=False,
                     )
         pace_s = every or 0.0
         if every is None and stop.n_records is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import OrderedDict
 from pathlib import Path
 from typing import Final
@@ -35,6 +36,7 @@ class Pictures:
 def _of_kept_frame(run: Path, camera: str, index: int) -> bytes | None:
     try:
         with RunStore.open(run) as store:
-            return picture_of(store.frame(index, camera))
+            full_scale_adu = float(json.loads(store.config_json)[camera]["full_scale_adu"])
+            return picture_of(store.frame(index, camera), full_scale_adu)
     except StoreError:
         return None

@@ -101,9 +101,9 @@ def _moment(text: Any) -> datetime | None:
         return None
     try:
         moment = datetime.fromisoformat(text.strip())
-    except ValueError:
+        return moment.replace(tzinfo=UTC) if moment.tzinfo is None else moment.astimezone(UTC)
+    except (ValueError, OverflowError):
         return None
-    return moment.replace(tzinfo=UTC) if moment.tzinfo is None else moment.astimezone(UTC)
 
 
 def _read_fits(data: bytes, path: Path) -> FrameFile:
@@ -118,24 +118,24 @@ def _read_fits(data: bytes, path: Path) -> FrameFile:
         exposure = next((header[key] for key in EXPOSURE_KEYWORDS if key in header), None)
         start = next((header[key] for key in START_KEYWORDS if key in header), None)
         request = header.get(REQUEST_KEYWORD)
-    except (KeyError, ValueError, TypeError, fits.VerifyError) as error:
+    except (KeyError, ValueError, TypeError, OverflowError, fits.VerifyError) as error:
         raise CommunicationError(f"{path}: its FITS header is not to be understood: {error}") from None
     if not axes or min(axes) < 1:
         raise CommunicationError(f"{path}: holds no image in its first part; write it there, not compressed")
     if kind not in ((8, 0.0, 1.0), (16, 0.0, 1.0), (16, 32768.0, 1.0)):
         raise CommunicationError(
-            f"{path}: BITPIX = {kind[0]}, BZERO = {kind[1]:g}, BSCALE = {kind[2]:g}; write unsigned integers of 8 or 16 bit"
+            f"{path}: BITPIX = {kind[0]}, BZERO = {kind[1]:g}, BSCALE = {kind[2]:g}; write unsigned integers of 8 or "
+            "16 bit"
         )
     n_bytes = kind[0] // 8 * math.prod(axes)
     if len(data) < n_header + n_bytes:
         raise UnfinishedFileError(f"{path.name}: {len(data)} bytes of {n_header + n_bytes}")
-    image: NDArray[Any] = np.frombuffer(data, np.uint8 if kind[0] == 8 else ">u2", math.prod(axes), n_header)
-    if kind[0] == 16:
-        image = image.astype(np.uint16)
-        if kind[1]:
-            image ^= 0x8000  # which adds 32768 to the signed number that is written
-        elif image.max() > np.iinfo(np.int16).max:
-            raise CommunicationError(f"{path}: has negative pixels; write unsigned integers (BZERO = 32768)")
+    stored, native = (np.uint8, np.uint8) if kind[0] == 8 else (">u2", np.uint16)
+    image: NDArray[Any] = np.frombuffer(data, stored, math.prod(axes), n_header).astype(native)
+    if kind[1]:
+        image ^= 0x8000  # which adds 32768 to the signed number that is stored
+    elif kind[0] == 16 and image.max() > np.iinfo(np.int16).max:
+        raise CommunicationError(f"{path}: has negative pixels; write unsigned integers (BZERO = 32768)")
     image = image.reshape(axes)
     if image.ndim == 3 and image.shape[0] == 3:  # one plane per colour: red, green, blue
         image = np.ascontiguousarray(image[::-1].transpose(1, 2, 0))

@@ -35,8 +35,9 @@ LOOK_UP_S = 0.1
 """While a frame is waited for: so often we look whether the camera is being closed, or gone."""
 N_BUFFERS = 3
 """Frames that the library keeps memory for; one is used at a time."""
-MAX_TRIGGER_DELAY_S = 0.1
-"""From a software trigger to its exposure, at most: a time stamp that says more is of another clock."""
+MAX_TRIGGER_DELAY_S = 0.005
+"""From a software trigger to its exposure, at most: a time stamp that says more is of another clock, or marks something
+else than the exposure's start."""
 NO_BLOCK_ID = 2**64 - 1
 """What the library gives for frames of cameras that do not count: its manual, `GetBlockID`."""
 
@@ -177,6 +178,7 @@ class PylonCamera:
         with self._lock, suppress(self._genicam.GenericException):
             self._trouble = self._trouble or f"{self._name}: is closed; open it again"
             self.device.Close()
+            self.device.DestroyDevice()  # a device that was unplugged is found again only after that
 
     def show_pictures(self, folder: Path) -> None:
         """An emulated camera shows the pictures in that folder from now on, one after the other, instead of patterns.
@@ -218,12 +220,7 @@ class PylonCamera:
                 nodes.set(offset, at, "offset_px")
             elif node is not None:
                 nodes.set_if_there(offset, node.GetMax() // 2 // node.GetInc() * node.GetInc())
-        gain = nodes.find("Gain", "GainRaw")
-        if gain is not None:
-            asked_gain = gain.GetMin() if settings.gain is None else type(gain.GetMin())(settings.gain)
-            nodes.set(gain.GetNode().GetName(), asked_gain, "gain")
-        elif settings.gain is not None:
-            nodes.need("Gain", "GainRaw")
+        self._set_gain()
         for selector in nodes.need("TriggerSelector").GetSymbolics():
             nodes.set("TriggerSelector", selector)
             nodes.set_if_there("TriggerMode", "Off")
@@ -235,6 +232,21 @@ class PylonCamera:
         self._range_us = (float(self._exposure.GetMin()), float(self._exposure.GetMax()))
         self._times = DeviceTimes(nodes, self._clock)
         self.device.MaxNumBuffer.SetValue(N_BUFFERS)
+
+    def _set_gain(self) -> None:
+        """As the config says, else the lowest; older GigE cameras have whole numbers of a unit of their own."""
+        asked = self._settings.gain
+        node = self._nodes.find("Gain", "GainRaw")
+        if node is None and asked is None:
+            return
+        node = self._nodes.need("Gain", "GainRaw")
+        lowest = node.GetMin()
+        if asked is not None and isinstance(lowest, int) and not asked.is_integer():
+            raise ConfigError(
+                f"{self._name}: gain = {asked:g} is refused; this camera takes whole numbers, {lowest} to "
+                f"{node.GetMax()}; change gain in the config"
+            )
+        self._nodes.set(node.GetNode().GetName(), lowest if asked is None else type(lowest)(asked), "gain")
 
     def _chosen_format(self) -> str:
         settings = self._settings

@@ -141,7 +141,8 @@ def test_the_line_rests_before_a_question() -> None:
     for _ in range(4):
         link.read(1, 3, 0, 1)
     moments_s = [moment_s for moment_s, _ in line.written]
-    assert all(later - sooner >= 0.02 for sooner, later in pairwise(moments_s))
+    # a waiting thread may be woken some microseconds early
+    assert all(later - sooner >= 0.0195 for sooner, later in pairwise(moments_s))
 
 
 @pytest.mark.parametrize("framing", Framing)

@@ -162,6 +162,16 @@ def test_frames_are_lossless_files_of_a_common_format(path: Path, run: RunStore)
     assert np.array_equal(np.asarray(Image.open(files[0]))[:, :, ::-1], colour)  # OpenCV's order is blue first
 
 
+def test_frames_of_more_than_8_bits_are_kept_to_the_last_one(path: Path, run: RunStore) -> None:
+    deep = np.random.default_rng(5).integers(0, 65_536, (30, 40), dtype=np.uint16)
+    with run:
+        run.add_frame(0, "star_camera", deep)
+        found = run.frame(0, "star_camera")
+    assert found.dtype == np.uint16
+    assert np.array_equal(found, deep)
+    assert np.array_equal(np.asarray(Image.open(path / "frames" / "000000_star_camera.png")), deep)
+
+
 def test_a_frame_that_changed_is_not_trusted(path: Path, run: RunStore) -> None:
     with run:
         run.add_frame(0, "star_camera", np.zeros((8, 8), dtype=np.uint8))
