@@ -16,6 +16,7 @@ def build_record_settings(config: InstrumentConfig) -> RecordSettings:
         shortest_s=section.shortest_exposure_s,
         longest_s=section.longest_exposure_s,
         max_motion_share=section.max_motion_share,
+        fetch_timeout_s=section.frame_timeout_s,
         region_radius_rad=deg_to_rad(section.region_radius_deg),
         star_zero_point_mag=section.star_zero_point_mag,
     )

@@ -218,6 +218,7 @@ class ReflectorMapSection(Section):
 class RecordingSection(Section):
     """How `namod-ctl record` exposes, and what it lets pass; everything has a default.
 
+    `frame_timeout_s`: so long after its exposure a frame is waited for; slow cameras need minutes.
     `region_radius_deg` is that of the directions around the telescope's axis that are to be covered.
     `star_zero_point_mag` is the magnitude of a star whose intensity, as records have it, is 1.
     """
@@ -226,6 +227,7 @@ class RecordingSection(Section):
     shortest_exposure_s: Annotated[float, within(1e-5, 60.0)] = 1e-3
     longest_exposure_s: Annotated[float, within(1e-3, 600.0)] = 3.0
     max_motion_share: Annotated[float, within(0.05, 5.0)] = 0.5
+    frame_timeout_s: Annotated[float, within(0.1, 600.0)] = 2.0
     region_radius_deg: Annotated[float, within(0.01, 10.0)] = 0.35
     star_zero_point_mag: Annotated[float, within(-50.0, 50.0)] | None = None
 

@@ -303,10 +303,10 @@ def _legend_lines(
             "White broken frame: do not turn."
         )
     side = "The picture is seen from the FRONT of the mirror, from its focal point. "
-    if has_bolts and instrument.bolts_seen_from == "back":
-        side += "Bolts are turned from BEHIND it: there left and right are exchanged, and + is clockwise as you see the bolt."
-    elif has_bolts:
-        side += "Bolts are turned from the FRONT, too: + is clockwise as you see the bolt."
+    if has_bolts:
+        behind = "BEHIND it: there left and right are exchanged, and"
+        place = behind if instrument.bolts_seen_from == "back" else "the FRONT, too:"
+        side += f"Bolts are turned from {place} + is clockwise as you see the bolt."
     return [headline, explanation, side]
 
 

@@ -148,7 +148,7 @@ def record(
             else:
                 session = _record_twin(stack, out, append, config, seed, twin_settings, force=force)
                 title = f"twin of {session.instrument.name}"
-                if not is_twin_wanted:
+                if not is_twin_wanted and session.config.star_camera.device is None:
                     console.print(
                         "The config names no cameras: this records the digital twin, not a sky (--twin says so); "
                         "cameras are named in [star_camera.device] and [reflector_camera.device].",
