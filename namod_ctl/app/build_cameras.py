@@ -39,6 +39,11 @@ def has_cameras(config: InstrumentConfig) -> bool:
     devices = {"star_camera": config.star_camera.device, "reflector_camera": config.reflector_camera.device}
     missing = [name for name, device in devices.items() if device is None or device.fed_by_twin]
     if len(missing) == 1:
+        if devices[missing[0]] is not None:
+            raise ConfigError(
+                f"{missing[0]}.device: fed_by_twin = true, but the other camera looks at a sky; say it of both or of "
+                "none, or take the digital twin with --twin"
+            )
         raise ConfigError(
             f"{missing[0]}.device: the config names the device of the other camera only; add this one, or record the "
             "digital twin with --twin"
@@ -88,7 +93,11 @@ def open_driver(settings: CameraSettings, clock: MonotonicClock) -> Camera:
 
 def open_camera(config: InstrumentConfig, role: Role, clock: MonotonicClock) -> Camera:
     """One camera of the config; it is opened again by itself when it gets lost. Raises what `open_driver` raises."""
-    settings = camera_settings(config, role)
+    return open_again_when_lost(camera_settings(config, role), clock)
+
+
+def open_again_when_lost(settings: CameraSettings, clock: MonotonicClock) -> Camera:
+    """The camera, which is opened again by itself when it gets lost. Raises what `open_driver` raises."""
     reset = reset_for(settings.driver, settings.serial_number)
     return Lifeline(partial(open_driver, settings, clock), clock, reset)
 

@@ -10,7 +10,7 @@ from namod_ctl.app.build_actuators import check_ports, open_actuators
 from namod_ctl.app.build_cameras import open_cameras
 from namod_ctl.app.build_correctors import campaign_outside, correct_by_motors, correct_by_people
 from namod_ctl.app.build_recording import build_record_settings
-from namod_ctl.app.build_sky_session import mapped_instrument, try_exposures
+from namod_ctl.app.build_sky_session import Tell, mapped_instrument, try_exposures
 from namod_ctl.app.config import InstrumentConfig
 from namod_ctl.core.clock import Clock, SystemClock, SystemMonotonicClock
 from namod_ctl.core.motion import StopSwitch
@@ -20,8 +20,10 @@ from namod_ctl.cycle.record import Equipment
 from namod_ctl.store.campaign import CampaignStore
 
 
-def check_hardware(config: InstrumentConfig) -> list[str]:
+def check_hardware(config: InstrumentConfig, tell: Tell) -> list[str]:
     """Open the cameras and the drives' lines for a moment, and try the cameras' exposures; the cameras' names.
+
+    `tell` as in `try_exposures`.
 
     Raises
     ------
@@ -33,7 +35,7 @@ def check_hardware(config: InstrumentConfig) -> list[str]:
     cameras = open_cameras(config, seconds)
     try:
         names = [camera.name for camera in cameras]
-        try_exposures(config, Equipment(*cameras, seconds, SystemClock()), instrument)
+        try_exposures(config, Equipment(*cameras, seconds, SystemClock()), instrument, tell)
     finally:
         for camera in cameras:
             camera.close()
@@ -69,6 +71,6 @@ def open_sky_campaign(
         else:
             buses = stack.enter_context(open_actuators(config))
             corrector = correct_by_motors(store, config, instrument, buses, seconds, switch)
-        outside = campaign_outside(lambda: Equipment(*open_cameras(config, seconds), seconds, SystemClock()))
+        outside = campaign_outside(stack, lambda: Equipment(*open_cameras(config, seconds), seconds, SystemClock()))
         record = replace(build_record_settings(config), keep_frames=wishes.record.keep_frames)
         yield Campaign(store, instrument, corrector, outside, replace(wishes, record=record), clock, switch, view)

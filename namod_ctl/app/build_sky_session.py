@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,27 +22,32 @@ from namod_ctl.store.run_lock import recording_lock
 
 DEFAULT_CONFIG = "fact"
 
+Tell = Callable[[str], None]
+"""Says something to whoever waits."""
+
 
 @dataclass(frozen=True, slots=True)
 class SkySession:
-    """What is recorded with, and into what; all of it is closed by the stack that it was opened on.
-
-    `remarks` say, for a person, how the cameras obeyed when they were tried.
-    """
+    """What is recorded with, and into what; all of it is closed by the stack that it was opened on."""
 
     equipment: Equipment
     instrument: Instrument
     config: InstrumentConfig
     store: RunStore
-    remarks: list[str]
 
 
 def open_sky_session(
-    stack: ExitStack, out: Path | None, append: Path | None, config_name: str | None, *, force: bool
+    stack: ExitStack,
+    out: Path | None,
+    append: Path | None,
+    config_name: str | None,
+    *,
+    force: bool,
+    tell: Tell = lambda text: None,
 ) -> SkySession | None:
     """A new run at `out`, or the run `append`, and the cameras of its config; None when that names no cameras.
 
-    The cameras are opened before a run is begun or replaced.
+    The cameras are opened before a run is begun or replaced. `tell` is told how they obey, see `try_exposures`.
 
     Raises
     ------
@@ -52,23 +58,23 @@ def open_sky_session(
         There is no such camera.
     """
     if append is not None:
-        return _resumed(stack, append, config_name)
+        return _resumed(stack, append, config_name, tell)
     config = load_config(config_name or DEFAULT_CONFIG)
     if out is None or not has_cameras(config):
         return None
     instrument = mapped_instrument(config)
     check_output(out, force=force)
     equipment = _open_equipment(stack, config)
-    remarks = try_exposures(config, equipment, instrument)
+    try_exposures(config, equipment, instrument, tell)
     source = f"{equipment.star_camera.name}; {equipment.reflector_camera.name}"
     facet_ids = [facet.id for facet in config.facets]
     store = RunStore.create(out, facet_ids, config.to_json(), source, equipment.wall_clock, force)
     stack.enter_context(store)
     stack.enter_context(recording_lock(store.path))
-    return SkySession(equipment, instrument, config, store, remarks)
+    return SkySession(equipment, instrument, config, store)
 
 
-def _resumed(stack: ExitStack, run: Path, config_name: str | None) -> SkySession | None:
+def _resumed(stack: ExitStack, run: Path, config_name: str | None, tell: Tell) -> SkySession | None:
     with RunStore.open(run) as store:
         config = InstrumentConfig.from_json(store.config_json, f"{run}: config")
         if noted_twin(store) is not None or not has_cameras(config):
@@ -77,14 +83,16 @@ def _resumed(stack: ExitStack, run: Path, config_name: str | None) -> SkySession
         raise ConfigError(f"{run}: was recorded with another config; leave --config out to go on with its own")
     instrument = mapped_instrument(config)
     equipment = _open_equipment(stack, config)
-    remarks = try_exposures(config, equipment, instrument)
+    try_exposures(config, equipment, instrument, tell)
     store = stack.enter_context(RunStore.open(run, read_only=False))
     stack.enter_context(recording_lock(store.path))
-    return SkySession(equipment, instrument, config, store, remarks)
+    return SkySession(equipment, instrument, config, store)
 
 
-def try_exposures(config: InstrumentConfig, equipment: Equipment, instrument: Instrument) -> list[str]:
-    """Whether the cameras make the exposures that they are asked for, in words; not asked of folders of frames.
+def try_exposures(config: InstrumentConfig, equipment: Equipment, instrument: Instrument, tell: Tell) -> None:
+    """Try whether the cameras make the exposures that they are asked for; not asked of folders of frames.
+
+    `tell` is told that it begins, as it takes a while in the dark, and what was found.
 
     Raises
     ------
@@ -102,7 +110,11 @@ def try_exposures(config: InstrumentConfig, equipment: Equipment, instrument: In
         for section, camera, model in cameras
         if section.device is not None and section.device.driver != "folder"  # whoever fills it exposes as he likes
     ]
-    return refuse_disobedient(asked, equipment.clock)
+    if not asked:
+        return
+    tell("Trying whether the cameras make the exposures that they are asked for; in the dark this takes half a minute.")
+    for remark in refuse_disobedient(asked, equipment.clock):
+        tell(remark)
 
 
 def mapped_instrument(config: InstrumentConfig) -> Instrument:

@@ -11,7 +11,7 @@ import numpy as np
 
 from namod_ctl.app.bench_sky import twin_equipment
 from namod_ctl.app.build import build_instrument
-from namod_ctl.app.build_cameras import CAMERA_CLASSES, Role, open_camera, open_driver
+from namod_ctl.app.build_cameras import CAMERA_CLASSES, Role, open_again_when_lost, open_camera
 from namod_ctl.app.build_twin import build_twin
 from namod_ctl.app.config import load_config
 from namod_ctl.core.clock import SystemMonotonicClock
@@ -141,4 +141,5 @@ def _of_driver(name: str, size: str, full_scale_adu: float) -> ChosenCamera:
         law=RadiometricLaw(1.0, -1.0, 0.0),
         full_scale_adu=full_scale_adu,
     )
-    return ChosenCamera(open_driver(settings, clock), model, deg_to_rad(UNKNOWN_STAR_PX), clock, False)
+    camera = open_again_when_lost(settings, clock)
+    return ChosenCamera(camera, model, deg_to_rad(UNKNOWN_STAR_PX), clock, False)

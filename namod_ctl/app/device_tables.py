@@ -112,15 +112,38 @@ class Inventory:
             f"{w} was not found{self._hint(w)}" for w in self.wanted if w.entry not in found and not self._is_there(w)
         ]
 
+    @property
+    def unlisted(self) -> list[str]:
+        """The config's entries that no driver lists, though they seem to be there, for a person."""
+        return [
+            f"{w}: {'the folder is there' if w.driver == 'folder' else 'its server answers'}; whether frames come is "
+            f"told by: namod-ctl camera snap {w.entry.removesuffix('_camera')} --config ..."
+            for w in self.wanted
+            if self._is_there(w)
+        ]
+
     def _is_there(self, wanted: WantedDevice) -> bool:
         """What no driver lists, as it cannot be looked for, but is there: a folder, a server in another network."""
         if wanted.driver == "folder":
             return Path(wanted.address).is_dir()
-        return wanted.server in self.answering
+        return wanted.server in self.answering and not self._neighbours(wanted)
+
+    def _neighbours(self, wanted: WantedDevice) -> list[str]:
+        """The names of all cameras that are listed of the entry's server."""
+        return [
+            camera.model
+            for listing in self.listings
+            for camera in listing.cameras
+            if camera.driver == wanted.driver
+            and wanted.server is not None
+            and wanted.server == _host_and_port(camera.address, DEFAULT_PORTS[wanted.driver])
+        ]
 
     def _hint(self, wanted: WantedDevice) -> str:
         if any(wanted.entry in self.entries_of_usb(device) for device in self.usb.devices):
             return ", though it is on the USB: install its driver, or end the program that uses it"
+        if neighbours := self._neighbours(wanted):
+            return f": its server has {', '.join(neighbours)}; correct device in the config"
         if wanted.server is not None:
             return f": no server answers at {wanted.server[0]}:{wanted.server[1]}; start it, or correct the address"
         return "" if wanted.driver != "folder" else ": there is no such folder"

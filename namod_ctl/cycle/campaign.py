@@ -180,8 +180,8 @@ class Campaign:
         if decision is Decision.VAGUE:
             self._record_again(why)
             return
-        if decision is Decision.WORSE and not self._n_poor:
-            # gaps in the pointings look alike, and taking back a good correction costs more than a longer look
+        if decision is Decision.WORSE and not self._n_poor and not self._corrector.has_learned:
+            # nobody knows why: gaps in the pointings look alike, and undoing a good correction costs more than a look
             self._record_again(f"{why}; a longer look must confirm it")
             return
         self._n_poor = 0

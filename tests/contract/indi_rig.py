@@ -17,6 +17,8 @@ SENSOR_COLUMNS, SENSOR_ROWS = 1280, 1024  # what the simulator has unless it is 
 SHORTEST_S, LONGEST_S = 0.01, 3600.0
 STAR_PX = (COLUMNS / 2.0, ROWS / 2.0)
 """Where the simulator draws a star that stands where it looks, in a frame that is centred on the sensor."""
+WHOLE_PX = 1.1
+"""It draws in whole pixels and looks near the pole: which side of the middle the star falls on, the hour decides."""
 
 _STAR_MAG = -3.0
 _POLLING = (

@@ -18,6 +18,7 @@ from rich.console import Console
 from namod_ctl.app.align_view import AlignView, cycle_table
 from namod_ctl.app.build_cameras import has_cameras
 from namod_ctl.app.build_sky_campaign import check_hardware, open_sky_campaign
+from namod_ctl.app.build_sky_session import Tell
 from namod_ctl.app.build_twin import load_twin_settings
 from namod_ctl.app.build_twin_campaign import open_twin_campaign
 from namod_ctl.app.campaign_report import write_campaign_report
@@ -110,6 +111,10 @@ def align(
     Example: namod-ctl align --out CAMPAIGN
     """
     console = Console(highlight=False)
+
+    def tell(text: str) -> None:
+        console.print(text, soft_wrap=True, markup=False)
+
     with ExitStack() as stack:
         if resume is not None:
             if twin or any(option is not None for option in (config, seed, twin_settings, out)):
@@ -118,10 +123,11 @@ def align(
         else:
             is_twin = twin or seed is not None or twin_settings is not None
             chosen = out or DEFAULT_OUT, config or DEFAULT_CONFIG
-            start = _begun(stack, *chosen, seed, twin_settings, is_twin=is_twin, force=force)
+            start = _begun(stack, *chosen, seed, twin_settings, tell, is_twin=is_twin, force=force)
         store = start.store
         if _has_ended(store, console):
             return
+        tell(_what_is_aligned(start))
         wishes = _wishes(store, records, cycles, approve, keep_frames)
         switch = StopSwitch()
         view = stack.enter_context(AlignView(console))
@@ -152,6 +158,7 @@ def _begun(
     config_name: str,
     seed: int | None,
     twin_settings: Path | None,
+    tell: Tell,
     *,
     is_twin: bool,
     force: bool,
@@ -164,11 +171,19 @@ def _begun(
         source = f"digital twin of {config.telescope.name}, seed {twin[1]}"
     else:
         check_output(out, force=force)
-        source = f"{config.telescope.name}; {', '.join(check_hardware(config))}"
+        source = f"{config.telescope.name}; {', '.join(check_hardware(config, tell))}"
     store = stack.enter_context(CampaignStore.create(out, config.to_json(), source, SystemClock(), force))
     if twin is not None:
         note_twin(store, *twin)
     return _Start(store, config, twin)
+
+
+def _what_is_aligned(start: _Start) -> str:
+    """So that nobody takes a rehearsal for the telescope, or the telescope for a rehearsal."""
+    if start.twin is not None:
+        return f"Aligning the {start.store.source}: a rehearsal, nothing real is recorded or moved."
+    who = "people turn its bolts" if start.config.actuators is None else "its drives will move"
+    return f"Aligning the telescope itself, {who}: {start.store.source}"
 
 
 def _resumed(stack: ExitStack, path: Path) -> _Start:

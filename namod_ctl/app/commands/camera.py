@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from itertools import islice
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -31,11 +31,15 @@ from namod_ctl.cycle.exposure_growth import ExposureFinding
 from namod_ctl.cycle.focus import FocusCourse, read_focus
 from namod_ctl.imaging.exposure import ExposureVerdict
 
+if TYPE_CHECKING:
+    from namod_ctl.app.focus_page.beside import FocusPage
+
 LINE_EVERY_S = 0.25
 """Lines come no faster than they can be read; the twin's frames would."""
 MAX_ATTEMPTS = 8
 """Three jumps of the exposure law cross the range of 1 ms to 3 s; some frames may get lost."""
 EXIT_REFUSED, EXIT_UNKNOWN = 1, 3
+FOCUS_HOST, FOCUS_PORT = "127.0.0.1", 8766  # the live page may be there too
 
 app = typer.Typer(
     add_completion=False, no_args_is_help=True, help="Try one camera: a frame, numbers, focus, exposures."
@@ -138,20 +142,41 @@ def focus(
     size: _Size = DEFAULT_SIZE,
     full_scale: _FullScale = 255.0,
     frames: _Frames = None,
+    page: Annotated[bool, typer.Option("--page", help="Show it on a page too, for a phone at the lens.")] = False,
+    port: Annotated[
+        int | None,
+        typer.Option(min=0, max=65535, help=f"Of --page; 0 takes one that is free.  [default: {FOCUS_PORT}]"),
+    ] = None,
+    host: Annotated[
+        str | None,
+        typer.Option(
+            help="Address to serve --page on; any but this computer's own shows it to the network.  "
+            f"[default: {FOCUS_HOST}]"
+        ),
+    ] = None,
 ) -> None:
     """Print how wide the star is, frame after frame, until Ctrl-C: turn the lens until the bar is shortest.
 
-    Example: namod-ctl camera focus star --twin
+    With --page a phone at the lens shows the same, with the course of the last two minutes and a picture of the star.
+
+    Example: namod-ctl camera focus star --twin --page
     """
-    with open_chosen(camera, config, size, full_scale, is_twin=twin) as chosen:
+    with (
+        _focus_page(camera, host, port, is_wanted=page) as shown,
+        open_chosen(camera, config, size, full_scale, is_twin=twin) as chosen,
+    ):
         course = FocusCourse()
 
         def line(look: Look) -> str:
-            if look.exposure is None:
-                return f"  {look.trouble}"
-            reading = read_focus(look.exposure.image, chosen.model, chosen.star_size_rad)
-            remark = course.add(reading)
-            return focus_line(reading, course.best_px, remark, has_plate_scale=chosen.has_plate_scale)
+            reading, text = None, f"  {look.trouble}"
+            if look.exposure is not None:
+                reading = read_focus(look.exposure.image, chosen.model, chosen.star_size_rad)
+                remark = course.add(reading)
+                text = focus_line(reading, course.best_px, remark, has_plate_scale=chosen.has_plate_scale)
+            if shown is not None:
+                now_s, is_given = time.monotonic(), exposure is not None
+                shown.show(now_s, look, reading, course.best_px, chosen, is_exposure_given=is_given)
+            return text
 
         _watched(Watch(chosen, exposure), frames, line)
         if not math.isfinite(course.best_px):
@@ -160,6 +185,27 @@ def focus(
             )
         angle = rad_to_arcmin(course.best_px * chosen.model.plate_scale_rad)
         _say(f"sharpest: {course.best_px:.2f} px" + (f", {angle:.2f} arcmin" if chosen.has_plate_scale else ""))
+
+
+@contextmanager
+def _focus_page(camera: str, host: str | None, port: int | None, *, is_wanted: bool) -> Iterator[FocusPage | None]:
+    """The page of the focus aid, announced; None when nobody wants it."""
+    if not is_wanted:
+        if host is not None or port is not None:
+            raise ConfigError("--host and --port are those of the page: add --page, or leave them out")
+        yield None
+        return
+    from namod_ctl.app.focus_page.beside import focus_page_beside  # a web server: only who wants the page waits for it
+
+    with focus_page_beside(camera, host or FOCUS_HOST, FOCUS_PORT if port is None else port) as shown:
+        if not shown.is_loopback:
+            typer.echo(
+                f"WARNING: --host {host} shows this page to everybody in the network, unencrypted; they can look, "
+                "but command nothing. For a phone on the dish use a network of your own.",
+                err=True,
+            )
+        _say(f"Look:     {shown.address}")
+        yield shown
 
 
 @app.command()

@@ -51,6 +51,8 @@ def _print(inventory: Inventory) -> None:
             console.print(Text(f"{listing.driver}: no camera"))
     if not inventory.ports:
         console.print(Text("no serial ports"))
+    for unlisted in inventory.unlisted:
+        console.print(Text(unlisted))
     for warning in inventory.usb.warnings:
         console.print(Text(f"warning: {warning}", style="yellow"))
     for missing in inventory.missing:

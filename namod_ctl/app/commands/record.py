@@ -128,8 +128,15 @@ def record(
     _refuse_beyond("--every", every, MAX_EVERY_S)
     _refuse_beyond("--region-radius-deg", region_radius_deg, MAX_REGION_RADIUS_DEG)
     stop = _stop_rule(records, minutes, until_uncertainty, is_replay=replay is not None)
+    if force and out is not None and out.is_dir():
+        with recording_lock(out):  # refuses a run into which somebody records: its records would be lost
+            pass
     console = Console(stderr=True, highlight=False)
     sky = None
+
+    def tell(text: str) -> None:
+        console.print(text, markup=False, soft_wrap=True)
+
     with ExitStack() as stack:
         if replay is not None:
             if twin or any(option is not None for option in (append, config, seed, every, twin_settings)):
@@ -139,12 +146,10 @@ def record(
         else:
             _refuse_unclear_goal(out, append, force=force)
             is_twin_wanted = twin or seed is not None or twin_settings is not None
-            sky = None if is_twin_wanted else open_sky_session(stack, out, append, config, force=force)
+            sky = None if is_twin_wanted else open_sky_session(stack, out, append, config, force=force, tell=tell)
             if sky is not None:
                 session = _Session(sky.equipment, sky.instrument, sky.config, sky.store, sky.store.path, pass_s=0.0)
                 title = session.instrument.name
-                for remark in sky.remarks:
-                    console.print(remark, markup=False, soft_wrap=True)
             else:
                 session = _record_twin(stack, out, append, config, seed, twin_settings, force=force)
                 title = f"twin of {session.instrument.name}"

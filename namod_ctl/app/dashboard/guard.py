@@ -20,6 +20,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 TOKEN_HEADER: Final = "x-namod-token"
 MAX_BODY_BYTES: Final = 4096
 MIN_TOKEN_LENGTH: Final = 12
+MAX_PATH_LENGTH: Final = 200
 
 _SECURITY_HEADERS: Final = {
     "content-security-policy": (
@@ -125,6 +126,8 @@ class Guard:
             await send(message)
 
         refused = refusal(scope["method"], Headers(scope=scope), self._rules)
+        if len(scope["path"]) > MAX_PATH_LENGTH:  # Python reads no number of thousands of digits
+            refused = 414, "there is no address of this length here"
         if refused is None:
             await self._app(scope, receive, send_guarded)
             return

@@ -24,7 +24,7 @@ from namod_ctl.app.dashboard.guard import MAX_BODY_BYTES, Guard, Rules
 from namod_ctl.app.dashboard.orders import Reply, carry_out, read_order
 from namod_ctl.app.dashboard.patience import PatientProtocol
 from namod_ctl.app.dashboard.pictures import Pictures
-from namod_ctl.core.errors import ConfigError
+from namod_ctl.core.errors import ConfigError, StoreError
 from namod_ctl.store.frames import REFLECTOR_CAMERA, STAR_CAMERA
 from namod_ctl.store.live_pictures import live_pictures
 
@@ -131,7 +131,10 @@ async def _command(request: Request, feed: Feed) -> Reply:
         return order
     if not feed.watched.is_campaign and order.kind != "stop":
         return Reply(409, "a plain recording can only be stopped")
-    step = await feed.ask(lambda watched: watched.step())
+    try:  # to stop needs nothing of what the disk says
+        step = 0 if order.kind == "stop" else await feed.ask(lambda watched: watched.step())
+    except StoreError as error:
+        return Reply(503, str(error))
     return await carry_out(feed.watched.path, order, step)
 
 

@@ -72,6 +72,7 @@ class Watched:
         self._config = config
         self.instrument: Instrument = facet_sections.instrument_of(config)
         self._glance: RunGlance | None = None
+        self._awaited_run: int | None = None  # a cycle is begun before its run is there, and nothing tells of that
         self._sent: Sections = {}
         self._alignments: dict[int, tuple[int, Alignment]] = {}
         self._pulse: Pulse | None = None
@@ -160,7 +161,11 @@ class Watched:
         return work_sheet(self.instrument, known[1], done) if known and turns else None
 
     def step(self) -> int:
-        """Number of the journal's last step of the campaign's machine, 0 without one."""
+        """Number of the journal's last step of the campaign's machine, 0 without one.
+
+        Raises StoreError when another campaign is there: what is seen of this one says nothing about that.
+        """
+        self._check_in_place()
         transition = self._campaign.last_transition() if self._campaign else None
         return transition.id if transition else 0
 
@@ -196,6 +201,9 @@ class Watched:
         if store is None or pulse is None:
             return
         is_other_process = self._looks_at_lock()
+        if self._awaited_run is not None and is_run(store.run_path(self._awaited_run)):
+            self._follow(store.run_path(self._awaited_run), self._awaited_run)
+            self._awaited_run = None
         if not pulse.has_changed() and not is_other_process:
             return
         cycles = store.cycles()
@@ -214,6 +222,7 @@ class Watched:
                 alignments[number], cycle.a_sigma_predicted_rad2, cycle.a_sigma_limit_rad2
             )
         runs = [cycle.number for cycle in cycles if is_run(store.run_path(cycle.number))]
+        self._awaited_run = next((cycle.number for cycle in cycles[-1:] if cycle.number not in runs), None)
         if runs and (self._glance is None or self._glance.key != runs[-1]):
             self._follow(store.run_path(runs[-1]), runs[-1])
 

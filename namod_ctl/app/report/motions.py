@@ -81,7 +81,8 @@ def _turn_chapter(number: int, turns: list[AskedTurns], checked: Mapping[int, st
     )
     n_done = sum(asked.is_done for asked in turns)
     words = (
-        f"{n_done} of {len(turns)} facets were marked as done. Turns in degrees, positive raises the leg to the sky."
+        f"{n_done} of {len(turns)} facets were marked as done. Turns in degrees, positive is clockwise as seen by who "
+        "turns."
     )
     return Chapter(f"Bolt turns in cycle {number}", (Text(words), Table(tuple(head), rows, frozenset({n_bolts + 2}))))
 

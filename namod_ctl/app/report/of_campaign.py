@@ -215,7 +215,7 @@ def _rejections(
 
 def _commands(store: CampaignStore, origin: Origin) -> tuple[str, ...]:
     wishes = {"records": max((cycle.n_records for cycle in store.cycles()), default=0)} | _wishes(store)
-    options = "".join(f" --{name} {wish}" for name, wish in wishes.items())
+    options = "".join(f" --{name.replace('_', '-')} {wish}" for name, wish in wishes.items())
     name = quoted(store.path.name)
     commands = [f"namod-ctl align {origin.options}{options} --out {name}", f"namod-ctl report {name}"]
     cycles = [cycle for cycle in store.cycles() if math.isfinite(cycle.a_sigma_now_rad2)]

@@ -67,7 +67,7 @@ def facet_table(alignment: Alignment) -> Table:
     """Every facet of one run: direction, uncertainty, width, correction and flags."""
     has_bolts = any(len(facet.bolt_turn_deg) for facet in alignment.facets)
     head = ("facet", "θx arcmin", "θy arcmin", "± arcmin", "width arcmin", "lit records",
-            "bolt turns deg" if has_bolts else "leg travels mm", "flags")  # fmt: skip
+            "bolt turns deg, + clockwise" if has_bolts else "leg travels mm", "flags")  # fmt: skip
     rows = []
     for facet in alignment.facets:
         x, y = rad_to_arcmin(facet.theta_rad)

@@ -115,6 +115,18 @@ def test_nothing_is_read_while_nobody_listens(tmp_path: Path) -> None:
         listening(tmp_path / "R", story)
 
 
+def test_a_cycle_is_followed_though_its_run_comes_after_the_last_word_of_the_campaign(tmp_path: Path) -> None:
+    with new_campaign(tmp_path / "C") as store, Watched(store.path) as watched:
+        for cycle in (1, 2):
+            store.begin_cycle()
+            assert "now" not in watched.look()
+            with new_run(store.run_path(cycle)) as run:
+                run.append([record(0, len(run.facet_ids))])
+                assert json.loads(watched.look()["now"])["run"] == cycle
+            store.save_cycle(replace(store.cycles()[-1], alignment_json=None, n_records=1))
+            watched.look()
+
+
 def test_new_cycle_of_a_campaign_is_followed(tmp_path: Path) -> None:
     with new_campaign(tmp_path / "C") as store, Watched(store.path) as watched:
         assert "now" not in watched.look()

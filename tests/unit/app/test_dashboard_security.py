@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import shutil
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,6 +20,7 @@ from namod_ctl.app.dashboard.server import build_app, page_files
 from namod_ctl.cycle.control import ControlBox, Request, RequestKind
 from namod_ctl.cycle.recording_control import RecordingControl
 from namod_ctl.store.campaign import CampaignStore
+from namod_ctl.store.campaign_database import CAMPAIGN_DATABASE_NAME
 
 HOST = "127.0.0.1:8765"
 GOOD = {"origin": f"http://{HOST}", "x-namod-token": TOKEN, "content-type": "application/json"}
@@ -121,6 +123,17 @@ def test_approval_holds_for_the_preview_that_was_seen_and_no_other(campaign: Cam
     assert len(worker.taken) == 1
 
 
+def test_page_of_a_campaign_that_was_replaced_can_stop_the_new_one_and_nothing_else(campaign: CampaignStore) -> None:
+    seen = campaign.add_transition("previewing", "awaiting_approval", "ask", "90 legs would move")
+    database = campaign.path / CAMPAIGN_DATABASE_NAME
+    with served(campaign.path) as client, Worker(campaign) as worker:
+        shutil.copyfile(database, database.with_name("other"))
+        database.with_name("other").replace(database)
+        assert client.post("/command", json={"kind": "approve", "step": seen}, headers=GOOD).status_code == 503
+        assert client.post("/command", content=STOP, headers=GOOD).status_code == 200
+    assert [request.kind for request in worker.taken] == [RequestKind.STOP]
+
+
 def test_nobody_at_work_is_said(tmp_path: Path) -> None:
     with new_campaign(tmp_path / "C"):
         pass
@@ -213,6 +226,11 @@ def test_nothing_but_the_page_is_given_out(tmp_path: Path, path: str) -> None:
     assert answer.status_code == 404
     assert b"SQLite" not in answer.content
     assert b"root:" not in answer.content
+
+
+def test_address_with_a_number_that_python_does_not_read_is_refused(tmp_path: Path) -> None:
+    with new_run(tmp_path / "R"), served(tmp_path / "R") as client:
+        assert client.get("/facet/" + "9" * 5000).status_code == 414
 
 
 def test_reading_under_a_foreign_name_is_refused(tmp_path: Path) -> None:

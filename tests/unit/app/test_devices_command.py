@@ -94,6 +94,26 @@ def test_what_is_missing_is_said_with_what_to_do() -> None:
     assert inventory(server, answering=(("10.0.0.7", 11111),)).missing == []
 
 
+def test_what_no_driver_lists_is_not_passed_over_in_silence(tmp_path: Path) -> None:
+    far = WantedDevice("star_camera", "indi", "", "10.0.0.7", "CCD Simulator")
+    folder = WantedDevice("reflector_camera", "folder", "", str(tmp_path))
+    told = inventory(far, folder, answering=(("10.0.0.7", 7624),)).unlisted
+    assert ["its server answers" in told[0], "the folder is there" in told[1]] == [True, True]
+    assert "namod-ctl camera snap reflector" in told[1]
+
+
+def test_a_camera_that_its_server_does_not_have_is_missing() -> None:
+    cameras = (FoundCamera("indi", "", "CCD Simulator", "", "127.0.0.1:7624"),)
+    there = WantedDevice("star_camera", "indi", "", "localhost", "CCD Simulator")
+    wrong = WantedDevice("reflector_camera", "indi", "", "localhost", "Guide Simulator")
+    answering = {("localhost", 7624)}
+    found = Inventory([DriverListing("indi", cameras)], [], UsbTree((), ()), (there, wrong), answering)
+    assert len(found.missing) == 1
+    assert "Guide Simulator" in found.missing[0]
+    assert "its server has CCD Simulator; correct device" in found.missing[0]
+    assert found.unlisted == []
+
+
 def test_a_folder_is_there_or_not(tmp_path: Path) -> None:
     assert inventory(WantedDevice("star_camera", "folder", "", str(tmp_path))).missing == []
     assert "no such folder" in inventory(WantedDevice("star_camera", "folder", "", str(tmp_path / "x"))).missing[0]

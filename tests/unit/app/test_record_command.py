@@ -164,6 +164,17 @@ def test_numbers_without_sense_are_refused(tmp_path: Path, option: str, value: s
     assert not (tmp_path / "NEW").exists()
 
 
+def test_force_does_not_replace_a_run_that_is_being_recorded(twin_run: Path, tmp_path: Path) -> None:
+    run = tmp_path / "RUN"
+    shutil.copytree(twin_run, run)
+    with recording_lock(run):
+        code, output = call("--twin", "--out", run, "--force", "--records", 1)
+    assert code == 2
+    assert "another program records into this run" in output
+    with RunStore.open(run) as store:
+        assert len(store.records()) >= 4
+
+
 def test_append_and_force_contradict_each_other(twin_run: Path) -> None:
     code, output = call("--append", twin_run, "--force", "--records", 9)
     assert code == 2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import subprocess
@@ -16,12 +17,14 @@ from typer.testing import CliRunner
 
 from namod_ctl.app.build_twin import load_twin_settings
 from namod_ctl.app.cli import app
+from namod_ctl.app.commands.align import NOTE_WISHES
 from namod_ctl.app.config import builtin_names, load_config
 from namod_ctl.app.report.document import Chapter, Document, Listing, Picture, Table, Text
 from namod_ctl.app.report.html_page import to_html
 from namod_ctl.app.report.pdf_pages import to_pdf
 from namod_ctl.app.report.toml_text import to_toml
 from namod_ctl.app.twin_note import note_twin, noted_twin
+from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.drives import Leg
 from namod_ctl.core.motion import MoveOrder, MoveOutcome, MoveResult
 from namod_ctl.store.campaign import CampaignStore
@@ -134,6 +137,17 @@ def test_the_commands_of_a_report_name_files_that_are_there_and_make_the_same_tw
     assert options["seed"] == str(SEED)
     with CampaignStore.open(campaign) as store:
         assert (load_twin_settings(reported / options["twin-settings"]), SEED) == noted_twin(store)
+
+
+def test_the_program_knows_every_option_of_the_command_that_a_report_names(tmp_path):
+    with CampaignStore.create(tmp_path / "C", small_config().to_json(), "a test", SystemClock()) as store:
+        store.set_note(NOTE_WISHES, json.dumps({"records": 90, "cycles": 3, "approve": "ask", "keep_frames": "all"}))
+    assert call("report", tmp_path / "C").exit_code == 0
+    page = Page((tmp_path / "C" / "report" / "report.html").read_bytes())
+    command = next(line for line in page.text.splitlines() if line.startswith("namod-ctl align"))
+    assert "--keep-frames all" in command
+    result = call(*command.split()[1:], "--help")
+    assert result.exit_code == 0, result.output
 
 
 def test_a_cycle_is_a_run_and_has_a_report_of_its_own(campaign, tmp_path):

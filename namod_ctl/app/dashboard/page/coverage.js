@@ -5,12 +5,15 @@ import { byId, drawn, setText } from "./dom.js";
 
 const STAR = "M0-.5.12-.15.48-.15.2.07.3.42 0 .21-.3.42-.2.07-.48-.15-.12-.15z";
 
-export function showCoverage(now) {
+export function showCoverage(now, standing) {
   const { counts, inside, most, radius_deg: radius, share } = now.coverage;
   const n = counts.length;
   const chart = byId("coverage");
   chart.setAttribute("viewBox", `0 0 ${n} ${n + 0.9}`);
-  setText(byId("steering"), now.steering[0].toUpperCase() + now.steering.slice(1));
+  // nobody is told to steer for a recording that has ended, or whose program is gone
+  const isSteered = standing?.is_running && ["recording", "paused"].includes(standing.state) && !now.live?.ended;
+  const steering = isSteered ? now.steering : "nothing is recorded at the moment";
+  setText(byId("steering"), steering[0].toUpperCase() + steering.slice(1));
   const place = ([x, y]) => [((x / radius + 1) / 2) * n, ((1 - y / radius) / 2) * n];
   const parts = [];
   counts.forEach((row, r) => row.forEach((count, c) => {
@@ -22,13 +25,13 @@ export function showCoverage(now) {
   const goal = place(now.next_deg);
   if (now.theta_deg.every((value) => value !== null)) {
     const star = place(now.theta_deg);
-    parts.push(drawn("line", { x1: star[0], y1: star[1], x2: goal[0], y2: goal[1], class: "way" }));
+    if (isSteered) parts.push(drawn("line", { x1: star[0], y1: star[1], x2: goal[0], y2: goal[1], class: "way" }));
     parts.push(drawn("path", { d: STAR, transform: `translate(${star[0]} ${star[1]}) scale(1.5)`, class: "star-mark" }));
   }
-  parts.push(drawn("path", { d: `M${goal[0] - 0.45} ${goal[1]}h.9M${goal[0]} ${goal[1] - 0.45}v.9`, class: "goal-mark" }));
+  if (isSteered) parts.push(drawn("path", { d: `M${goal[0] - 0.45} ${goal[1]}h.9M${goal[0]} ${goal[1] - 0.45}v.9`, class: "goal-mark" }));
   const text = { y: n + 0.65, "font-size": 0.5, class: "axis-text" };
   parts.push(drawn("text", { ...text, x: 0 }, `${(-radius).toFixed(2)}°`));
   parts.push(drawn("text", { ...text, x: n, "text-anchor": "end" }, `+${radius.toFixed(2)}°`));
   chart.replaceChildren(...parts);
-  chart.setAttribute("aria-label", `${Math.round(100 * (share ?? 0))} per cent of the region have a record. ${now.steering}.`);
+  chart.setAttribute("aria-label", `${Math.round(100 * (share ?? 0))} per cent of the region have a record. ${steering}.`);
 }

@@ -36,11 +36,12 @@ const draw = {
     if (state !== before) nextMessage(byId("spoken"), `${state}. Next: ${standing.next}`);
     showCommands(standing);
     showMarks(standing);
+    if (known.now) showCoverage(known.now, standing);
     showFacetDetails(known);
   },
   now(now) {
     showRecords(now);
-    showCoverage(now);
+    showCoverage(now, known.standing);
     showStar(now);
     showMirrorPicture(now);
     refreshFacet(known);
@@ -89,11 +90,8 @@ function setUpMode() {
   show();
   button.addEventListener("click", () => {
     document.documentElement.dataset.mode = isNight() ? "day" : "night";
-    try {
-      localStorage.setItem("namod-mode", document.documentElement.dataset.mode);
-    } catch {
-      // without storage it holds for this page
-    }
+    // a cookie, for cookies know no port: `--dashboard` takes another one every night
+    document.cookie = `namod-mode=${document.documentElement.dataset.mode}; max-age=31536000; path=/; samesite=strict`;
     show();
     for (const [name, value] of Object.entries(known)) if (!["about", "standing", "clock", "sheets"].includes(name)) draw[name](value);
   });

@@ -3,7 +3,7 @@
 const EVERY_MS = 700;
 
 export class Picture {
-  constructor(image, camera) {
+  constructor(image, camera, onShown = () => {}) {
     this.image = image;
     this.camera = camera;
     this.isKept = false;
@@ -11,17 +11,18 @@ export class Picture {
     this.begun = -Infinity;
     this.timer = 0;
     this.isBusy = false;
-    image.addEventListener("load", () => { image.hidden = false; this.done(); });
+    image.addEventListener("load", () => { image.hidden = false; onShown(this.markFetched); this.done(); });
     image.addEventListener("error", () => this.done());
   }
 
-  show(now) {
+  show(now, mark = null) { // `mark` belongs to this frame: it is handed back when the frame is to be seen
     const index = now.frames[this.camera];
     this.isKept = index !== undefined;
     if (!this.isKept) {
       this.image.hidden = true;
       return;
     }
+    this.mark = mark;
     this.wanted = `/frame/${now.run}/${this.camera}/${index}`;
     this.fetch();
   }
@@ -35,7 +36,7 @@ export class Picture {
     }
     this.isBusy = true;
     this.begun = performance.now();
-    this.fetched = this.wanted;
+    [this.fetched, this.markFetched] = [this.wanted, this.mark];
     this.image.src = this.wanted;
   }
 
