@@ -14,8 +14,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from namod_ctl.app.build_twin_campaign import open_twin_campaign
-from namod_ctl.app.config import load_config
+from namod_ctl.app.build.twin_campaign import open_twin_campaign
+from namod_ctl.app.config.instrument import load_config
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.motion import StopSwitch
 from namod_ctl.core.units import rad2_to_arcmin2

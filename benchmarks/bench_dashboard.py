@@ -27,7 +27,7 @@ from pathlib import Path
 
 import numpy as np
 
-from namod_ctl.app.config import load_config
+from namod_ctl.app.config.instrument import load_config
 from namod_ctl.app.dashboard.server import page_files
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.records import Record

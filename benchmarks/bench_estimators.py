@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import least_squares
 
-from namod_ctl.app.build import build_instrument
-from namod_ctl.app.config import load_config
+from namod_ctl.app.build.instrument import build_instrument
+from namod_ctl.app.config.instrument import load_config
 from namod_ctl.core.units import arcmin_to_rad, deg_to_rad
 from namod_ctl.reconstruction.estimators import SIMPLE_ESTIMATORS
 from namod_ctl.reconstruction.reconstruct import reconstruct

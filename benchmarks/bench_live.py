@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from bench_record import RealClock, StoredFrames, make_frames
 
-from namod_ctl.app.build import build_instrument
-from namod_ctl.app.config import load_config
+from namod_ctl.app.build.instrument import build_instrument
+from namod_ctl.app.config.instrument import load_config
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.drives import DriveState, Leg
 from namod_ctl.cycle.live_status import LiveNote, LivePictures

@@ -18,8 +18,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from namod_ctl.app.build import build_instrument
-from namod_ctl.app.config import load_config
+from namod_ctl.app.build.instrument import build_instrument
+from namod_ctl.app.config.instrument import load_config
 from namod_ctl.core.units import arcmin_to_rad, deg_to_rad
 from namod_ctl.optics.instrument import Instrument
 from namod_ctl.optics.reflector import Reflector

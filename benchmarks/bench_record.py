@@ -18,8 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from namod_ctl.app.build import build_instrument
-from namod_ctl.app.config import load_config
+from namod_ctl.app.build.instrument import build_instrument
+from namod_ctl.app.config.instrument import load_config
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.interfaces import Exposure
 from namod_ctl.cycle.progress import Progress

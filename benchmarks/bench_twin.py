@@ -27,8 +27,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from namod_ctl.app.build_twin import build_twin
-from namod_ctl.app.config import InstrumentConfig, builtin_folder, load_config
+from namod_ctl.app.build.twin import build_twin
+from namod_ctl.app.config.instrument import InstrumentConfig, builtin_folder, load_config
 from namod_ctl.twin.settings import TwinSettings
 from namod_ctl.twin.twin import Twin
 

@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from namod_ctl.app.build_twin import build_twin
-from namod_ctl.app.config import load_config
+from namod_ctl.app.build.twin import build_twin
+from namod_ctl.app.config.instrument import load_config
 from namod_ctl.core.units import rad_to_arcmin
 from namod_ctl.cycle.record import Equipment, Recorder, RecordSettings, StopRule
 from namod_ctl.reconstruction.estimators import SIMPLE_ESTIMATORS

@@ -279,7 +279,11 @@ def facet_table(alignment: Alignment) -> QTable:
     for leg in range(travel_m.shape[1]):
         add(f"leg_{leg + 1}_travel", (travel_m[:, leg] * u.m).to(u.mm), "travel along +z (to the sky)")
     for leg in range(turn_deg.shape[1]):
-        add(f"bolt_{leg + 1}_turn", turn_deg[:, leg] * u.deg, "turn of the bolt, positive is clockwise as seen by who turns")
+        add(
+            f"bolt_{leg + 1}_turn",
+            turn_deg[:, leg] * u.deg,
+            "turn, positive is clockwise as seen by who turns",
+        )
     add("flags", ["|".join(facet.flags.names) for facet in facets], "what stands against the estimate; see meta")
     add("remarks", ["; ".join(facet.remarks) for facet in facets], "for people")
     table.meta = _table_meta(alignment)

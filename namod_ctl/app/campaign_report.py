@@ -11,15 +11,15 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from namod_ctl.app.alignment_files import alignment_from_json
-from namod_ctl.app.build import build_instrument
-from namod_ctl.app.build_twin import with_facet_map
-from namod_ctl.app.config import InstrumentConfig
-from namod_ctl.app.figure_style import DPI, ORANGE, SKY, figure_to_png
-from namod_ctl.app.figures import draw_psf_sum
-from namod_ctl.app.number_ranges import counted
-from namod_ctl.app.psf_panels import measured_panels
+from namod_ctl.app.build.instrument import build_instrument
+from namod_ctl.app.build.twin import with_facet_map
+from namod_ctl.app.config.instrument import InstrumentConfig
+from namod_ctl.app.pictures.figure_style import DPI, ORANGE, SKY, figure_to_png
+from namod_ctl.app.pictures.figures import draw_psf_sum
+from namod_ctl.app.pictures.psf_panels import measured_panels
 from namod_ctl.app.report.journal import journal_rows
 from namod_ctl.app.report.parts import area_text, when_text
+from namod_ctl.app.views.number_ranges import counted
 from namod_ctl.core.units import rad2_to_arcmin2, rad_to_arcmin
 from namod_ctl.cycle.machine import STATES
 from namod_ctl.optics.instrument import Instrument

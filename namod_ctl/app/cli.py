@@ -11,7 +11,7 @@ import typer
 from typer.core import TyperGroup
 
 from namod_ctl import __version__
-from namod_ctl.app.greeting import GREETING
+from namod_ctl.app.views.greeting import GREETING
 from namod_ctl.core.errors import NamodError
 
 MARKUP: Literal["markdown"] = (

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from namod_ctl.app.build import build_instrument
-from namod_ctl.app.config import InstrumentConfig
-from namod_ctl.app.twin_note import NOTE_SEED, NOTE_SETTINGS
+from namod_ctl.app.build.instrument import build_instrument
+from namod_ctl.app.build.twin_note import NOTE_SEED, NOTE_SETTINGS
+from namod_ctl.app.config.instrument import InstrumentConfig
 from namod_ctl.core.clock import Clock
 from namod_ctl.core.errors import ConfigError, DataQualityError
 from namod_ctl.core.records import Record

@@ -16,8 +16,8 @@ from focus_samples import ARCMIN_PER_PX, chosen_camera, look_at, show, star_fram
 from page_rig import NOT_RED, OVERLAPS, SIZES, Watcher
 from playwright.sync_api import Browser, Page, expect
 
-from namod_ctl.app.camera_views import Look
 from namod_ctl.app.focus_page.beside import FocusPage, focus_page_beside
+from namod_ctl.app.views.camera_views import Look
 from namod_ctl.cycle.focus import FocusCourse
 from namod_ctl.imaging.exposure import ExposureVerdict
 

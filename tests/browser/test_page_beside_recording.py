@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from page_rig import BY_HAND, TWIN, wait_until
 
-from namod_ctl.app.build_recording import build_record_settings
-from namod_ctl.app.build_twin import build_twin, load_twin_settings
-from namod_ctl.app.config import InstrumentConfig, load_config
+from namod_ctl.app.build.recording import build_record_settings
+from namod_ctl.app.build.twin import build_twin, load_twin_settings
+from namod_ctl.app.config.instrument import InstrumentConfig, load_config
 from namod_ctl.app.dashboard.beside import dashboard_beside
 from namod_ctl.core.records import Record
 from namod_ctl.cycle.record import Equipment, Recorder, StopRule

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from page_rig import Watcher
 from playwright.sync_api import Browser, Page, expect
 
-from namod_ctl.app.figure_style import figure_to_png
+from namod_ctl.app.pictures.figure_style import figure_to_png
 from namod_ctl.app.report.document import Chapter, Document, Picture, Table, Text
 from namod_ctl.app.report.html_page import to_html
 

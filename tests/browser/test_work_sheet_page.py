@@ -21,7 +21,7 @@ from page_rig import (
 )
 from playwright.sync_api import Browser, Page, expect
 
-from namod_ctl.app.config import InstrumentConfig
+from namod_ctl.app.config.instrument import InstrumentConfig
 from namod_ctl.app.dashboard.facet_sections import instrument_of
 from namod_ctl.store.campaign import CampaignStore
 

@@ -13,8 +13,8 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from namod_ctl.app.build_twin_campaign import open_twin_campaign
-from namod_ctl.app.config import InstrumentConfig, load_config
+from namod_ctl.app.build.twin_campaign import open_twin_campaign
+from namod_ctl.app.config.instrument import InstrumentConfig, load_config
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.drives import Leg
 from namod_ctl.core.motion import MoveOutcome, StopSwitch

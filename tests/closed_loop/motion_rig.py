@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from namod_ctl.app.build_actuators import build_motion_settings
-from namod_ctl.app.build_twin_actuators import build_twin_actuators, twin_wiring
-from namod_ctl.app.config import InstrumentConfig, load_config
+from namod_ctl.app.build.actuators import build_motion_settings
+from namod_ctl.app.build.twin_actuators import build_twin_actuators, twin_wiring
+from namod_ctl.app.config.instrument import InstrumentConfig, load_config
 from namod_ctl.core.drives import DriveState, Leg
 from namod_ctl.core.interfaces import MonotonicClock
 from namod_ctl.core.motion import MoveOrder, MoveOutcome, MoveResult, StopSwitch

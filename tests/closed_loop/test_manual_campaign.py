@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from namod_ctl.app.build_twin import build_twin
-from namod_ctl.app.build_twin_campaign import open_twin_campaign
-from namod_ctl.app.config import InstrumentConfig, load_config
+from namod_ctl.app.build.twin import build_twin
+from namod_ctl.app.build.twin_campaign import open_twin_campaign
+from namod_ctl.app.config.instrument import InstrumentConfig, load_config
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.motion import StopSwitch
 from namod_ctl.core.units import arcmin_to_rad, deg_to_rad

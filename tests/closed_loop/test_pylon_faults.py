@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from campaign_rig import SEED, SETTINGS, small_config
 
-from namod_ctl.app import bench_sky
-from namod_ctl.app.bench_sky import twin_equipment
-from namod_ctl.app.build_recording import build_record_settings
-from namod_ctl.app.build_twin import build_twin
+from namod_ctl.app.build.bench_sky import twin_equipment
+from namod_ctl.app.build.instrument import bench_sky
+from namod_ctl.app.build.recording import build_record_settings
+from namod_ctl.app.build.twin import build_twin
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.errors import DeviceFaultError
 from namod_ctl.core.interfaces import MonotonicClock

@@ -14,10 +14,10 @@ from typing import Literal
 
 import pytest
 
-from namod_ctl.app import build_cameras
-from namod_ctl.app.build_sky_campaign import check_hardware, open_sky_campaign
-from namod_ctl.app.build_twin import build_twin
-from namod_ctl.app.config import InstrumentConfig, load_config
+from namod_ctl.app.build.instrument import cameras as build_cameras
+from namod_ctl.app.build.sky_campaign import check_hardware, open_sky_campaign
+from namod_ctl.app.build.twin import build_twin
+from namod_ctl.app.config.instrument import InstrumentConfig, load_config
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.errors import DeviceFaultError
 from namod_ctl.core.interfaces import Camera, Exposure, MonotonicClock

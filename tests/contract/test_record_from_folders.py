@@ -14,11 +14,11 @@ import typer
 from frame_program import FrameProgram, Write, write_fits, write_png
 from typer.testing import CliRunner
 
-from namod_ctl.app.build_recording import build_record_settings
-from namod_ctl.app.build_sky_session import open_sky_session
-from namod_ctl.app.build_twin import build_twin
+from namod_ctl.app.build.recording import build_record_settings
+from namod_ctl.app.build.sky_session import open_sky_session
+from namod_ctl.app.build.twin import build_twin
 from namod_ctl.app.commands.record import record
-from namod_ctl.app.config import load_config
+from namod_ctl.app.config.instrument import load_config
 from namod_ctl.core.clock import SystemMonotonicClock
 from namod_ctl.cycle.progress import Progress
 from namod_ctl.cycle.record import Recorder, StopRule

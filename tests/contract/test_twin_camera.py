@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from camera_contract import CameraContract, CameraRig
 
-from namod_ctl.app.build_twin import build_twin
-from namod_ctl.app.config import InstrumentConfig, load_config
+from namod_ctl.app.build.twin import build_twin
+from namod_ctl.app.config.instrument import InstrumentConfig, load_config
 from namod_ctl.twin.settings import TwinSettings
 
 STAR_COLUMNS, STAR_ROWS = 400, 320

@@ -18,11 +18,11 @@ from pathlib import Path
 import pytest
 from campaign_lives import N_RECORDS, Life, Nursery, begin
 
-from namod_ctl.app.build_twin import build_twin
-from namod_ctl.app.build_twin_actuators import twin_wiring
-from namod_ctl.app.build_twin_campaign import WORLD_FILE
-from namod_ctl.app.config import InstrumentConfig
-from namod_ctl.app.twin_note import noted_twin
+from namod_ctl.app.build.twin import build_twin
+from namod_ctl.app.build.twin_actuators import twin_wiring
+from namod_ctl.app.build.twin_campaign import WORLD_FILE
+from namod_ctl.app.build.twin_note import noted_twin
+from namod_ctl.app.config.instrument import InstrumentConfig
 from namod_ctl.core.drives import Leg
 from namod_ctl.core.motion import MoveOutcome
 from namod_ctl.core.units import mm_to_m, um_to_m

@@ -11,7 +11,7 @@ from pathlib import Path
 from campaign_lives import CONFIG, Life, Nursery, begin
 from typer.testing import CliRunner
 
-from namod_ctl.app.build_twin_campaign import WORLD_FILE
+from namod_ctl.app.build.twin_campaign import WORLD_FILE
 from namod_ctl.app.cli import app
 from namod_ctl.store.campaign import CampaignStore
 from namod_ctl.store.campaign_rows import TRANSITION

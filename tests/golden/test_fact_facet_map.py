@@ -19,8 +19,8 @@ import cv2
 import numpy as np
 import pytest
 
-from namod_ctl.app.build import build_instrument
-from namod_ctl.app.config import load_config
+from namod_ctl.app.build.instrument import build_instrument
+from namod_ctl.app.config.instrument import load_config
 from namod_ctl.app.facet_editor.workbench import Workbench, scaled_camera
 from namod_ctl.optics.facet_marks import MarkedPose, MarksError, pose_of_marks
 

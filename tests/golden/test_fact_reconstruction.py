@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from namod_ctl.app.build import build_instrument
+from namod_ctl.app.build.instrument import build_instrument
 from namod_ctl.app.cli import main
-from namod_ctl.app.config import InstrumentConfig
+from namod_ctl.app.config.instrument import InstrumentConfig
 from namod_ctl.core.units import deg_to_rad, rad2_to_arcmin2, rad_to_arcmin
 from namod_ctl.reconstruction.estimators import SIMPLE_ESTIMATORS
 from namod_ctl.reconstruction.halves import compare_halves

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from namod_ctl.app.build_twin import build_twin
-from namod_ctl.app.config import load_config
+from namod_ctl.app.build.twin import build_twin
+from namod_ctl.app.config.instrument import load_config
 from namod_ctl.core.units import arcmin_to_rad
 from namod_ctl.cycle.record import Equipment, Recorder, RecordSettings, StopRule
 from namod_ctl.reconstruction.responses import tabulate_responses

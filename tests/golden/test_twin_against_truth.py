@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from namod_ctl.app.build_twin import build_twin
-from namod_ctl.app.config import load_config
+from namod_ctl.app.build.twin import build_twin
+from namod_ctl.app.config.instrument import load_config
 from namod_ctl.core.units import arcmin_to_rad, rad2_to_arcmin2
 from namod_ctl.optics.coordinates import direction_to_star, rotation_to_normal
 from namod_ctl.optics.raytrace import sample_outline

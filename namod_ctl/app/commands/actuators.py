@@ -15,7 +15,10 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
-from namod_ctl.app.actuator_tables import (
+from namod_ctl.app.build.actuators import build_bus_settings, build_motion_settings, open_actuators
+from namod_ctl.app.build.twin_actuators import build_twin_actuators, twin_wiring
+from namod_ctl.app.config.instrument import InstrumentConfig, load_config
+from namod_ctl.app.views.actuator_tables import (
     identity_lines,
     legs_named,
     table_of_drives,
@@ -24,10 +27,7 @@ from namod_ctl.app.actuator_tables import (
     table_of_tests,
     table_of_words,
 )
-from namod_ctl.app.build_actuators import build_bus_settings, build_motion_settings, open_actuators
-from namod_ctl.app.build_twin_actuators import build_twin_actuators, twin_wiring
-from namod_ctl.app.config import InstrumentConfig, load_config
-from namod_ctl.app.number_ranges import counted, legs_in_words
+from namod_ctl.app.views.number_ranges import counted, legs_in_words
 from namod_ctl.core.clock import SystemMonotonicClock
 from namod_ctl.core.drives import DriveState, Leg
 from namod_ctl.core.errors import CommunicationError, ConfigError

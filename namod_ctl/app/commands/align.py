@@ -15,16 +15,16 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from namod_ctl.app.align_view import AlignView, cycle_table
-from namod_ctl.app.build_cameras import has_cameras
-from namod_ctl.app.build_sky_campaign import check_hardware, open_sky_campaign
-from namod_ctl.app.build_sky_session import Tell
-from namod_ctl.app.build_twin import load_twin_settings
-from namod_ctl.app.build_twin_campaign import open_twin_campaign
+from namod_ctl.app.build.cameras import has_cameras
+from namod_ctl.app.build.sky_campaign import check_hardware, open_sky_campaign
+from namod_ctl.app.build.sky_session import Tell
+from namod_ctl.app.build.twin import load_twin_settings
+from namod_ctl.app.build.twin_campaign import open_twin_campaign
+from namod_ctl.app.build.twin_note import note_twin, noted_twin
 from namod_ctl.app.campaign_report import write_campaign_report
-from namod_ctl.app.config import InstrumentConfig, load_config
+from namod_ctl.app.config.instrument import InstrumentConfig, load_config
 from namod_ctl.app.dashboard.beside import dashboard_beside
-from namod_ctl.app.twin_note import note_twin, noted_twin
+from namod_ctl.app.views.align_view import AlignView, cycle_table
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.motion import StopSwitch

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from namod_ctl.app.camera_choice import DEFAULT_SIZE, ChosenCamera, open_chosen
-from namod_ctl.app.camera_views import (
+from namod_ctl.app.build.camera_choice import DEFAULT_SIZE, ChosenCamera, open_chosen
+from namod_ctl.app.views.camera_views import (
     Look,
     Watch,
     check_file,

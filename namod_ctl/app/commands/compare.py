@@ -11,11 +11,11 @@ import typer
 from rich.console import Console
 
 from namod_ctl.app.alignment_files import read_alignment
-from namod_ctl.app.build import build_instrument
-from namod_ctl.app.config import InstrumentConfig
-from namod_ctl.app.drift_table import DRIFT_FILE, drift_csv, drift_summary, drift_table
-from namod_ctl.app.figure_style import figure_to_png
-from namod_ctl.app.fingerprints import FINGERPRINTS_FILE, Fingerprint, draw_fingerprints
+from namod_ctl.app.build.instrument import build_instrument
+from namod_ctl.app.config.instrument import InstrumentConfig
+from namod_ctl.app.pictures.figure_style import figure_to_png
+from namod_ctl.app.pictures.fingerprints import FINGERPRINTS_FILE, Fingerprint, draw_fingerprints
+from namod_ctl.app.views.drift_table import DRIFT_FILE, drift_csv, drift_summary, drift_table
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.optics.reflector import Reflector
 from namod_ctl.reconstruction.alignment import Alignment

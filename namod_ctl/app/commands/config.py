@@ -10,10 +10,10 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from namod_ctl.app.build import build_instrument
-from namod_ctl.app.build_actuators import check_ports
-from namod_ctl.app.config import builtin_names, find_config, load_config
-from namod_ctl.app.config_summary import Summary, summarize, warnings_of
+from namod_ctl.app.build.actuators import check_ports
+from namod_ctl.app.build.instrument import build_instrument
+from namod_ctl.app.config.instrument import builtin_names, find_config, load_config
+from namod_ctl.app.config.summary import Summary, summarize, warnings_of
 from namod_ctl.core.errors import ConfigError
 
 app = typer.Typer(

@@ -9,9 +9,9 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
-from namod_ctl.app.camera_listing import list_all_cameras
-from namod_ctl.app.config import load_config
-from namod_ctl.app.device_tables import Inventory, answering_servers, as_json, tables, wanted_devices
+from namod_ctl.app.config.instrument import load_config
+from namod_ctl.app.views.camera_listing import list_all_cameras
+from namod_ctl.app.views.device_tables import Inventory, answering_servers, as_json, tables, wanted_devices
 from namod_ctl.devices.ports import list_serial_ports
 from namod_ctl.devices.usb_tree import read_usb_tree
 

@@ -11,8 +11,8 @@ import typer
 from numpy.typing import NDArray
 
 from namod_ctl.app.alignment_files import facet_table, read_alignment, table_to_ecsv, table_to_fits
-from namod_ctl.app.build import build_instrument
-from namod_ctl.app.config import InstrumentConfig
+from namod_ctl.app.build.instrument import build_instrument
+from namod_ctl.app.config.instrument import InstrumentConfig
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.optics.coordinates import correction_of_theta
 from namod_ctl.optics.raytrace import tilted_normals

@@ -9,7 +9,7 @@ import numpy as np
 import typer
 
 from namod_ctl.app.commands.instruct import read_picture
-from namod_ctl.app.config import load_config
+from namod_ctl.app.config.instrument import load_config
 from namod_ctl.app.facet_editor.workbench import Workbench, open_workbench
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.optics.polygons import map_faults

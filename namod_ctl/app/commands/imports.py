@@ -12,9 +12,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from namod_ctl.app.build import build_instrument
-from namod_ctl.app.config import InstrumentConfig, load_config
-from namod_ctl.app.config_schema import TripodMountSection
+from namod_ctl.app.build.instrument import build_instrument
+from namod_ctl.app.config.instrument import InstrumentConfig, load_config
+from namod_ctl.app.config.schema import TripodMountSection
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.flags import REJECT_REASON_MEANING

@@ -13,18 +13,18 @@ import typer
 from numpy.typing import NDArray
 
 from namod_ctl.app.alignment_files import read_alignment
-from namod_ctl.app.build import build_instrument
-from namod_ctl.app.config import InstrumentConfig
-from namod_ctl.app.figure_style import figure_to_png
-from namod_ctl.app.instruction_sheets import PDF_FILE, sheets_to_pdf
-from namod_ctl.app.instructions import (
+from namod_ctl.app.build.instrument import build_instrument
+from namod_ctl.app.config.instrument import InstrumentConfig
+from namod_ctl.app.pictures.figure_style import figure_to_png
+from namod_ctl.app.sheets.instructions import (
     CSV_FILE,
     FacetInstruction,
     Verdict,
     facet_instructions,
     instructions_to_csv,
 )
-from namod_ctl.app.overlay import PNG_FILE, draw_instructions
+from namod_ctl.app.sheets.ladder_sheets import PDF_FILE, sheets_to_pdf
+from namod_ctl.app.sheets.overlay import PNG_FILE, draw_instructions
 from namod_ctl.core.errors import ConfigError, StoreError
 from namod_ctl.core.flags import FacetFlag
 from namod_ctl.optics.instrument import Instrument

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from namod_ctl.app.build import build_instrument
-from namod_ctl.app.config import load_config
+from namod_ctl.app.build.instrument import build_instrument
+from namod_ctl.app.config.instrument import load_config
 from namod_ctl.core.units import arcsec_to_rad, deg_to_rad, m_to_mm, rad2_to_arcmin2, rad_to_arcmin
 from namod_ctl.optics.raytrace import (
     RayTrace,

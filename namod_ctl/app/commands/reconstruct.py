@@ -11,17 +11,17 @@ import typer
 from rich.console import Console
 
 from namod_ctl.app.alignment_files import ALIGNMENT_FILE, alignment_files, alignment_to_json
-from namod_ctl.app.build import build_instrument
+from namod_ctl.app.build.instrument import build_instrument
 from namod_ctl.app.combined_run import combined_run
-from namod_ctl.app.config import InstrumentConfig
-from namod_ctl.app.figure_style import figure_to_png
-from namod_ctl.app.figures import EXPOSURE_MAP_FILE, PSF_SUM_FILE, draw_exposure_map, draw_psf_sum
-from namod_ctl.app.instruction_sheets import PDF_FILE
-from namod_ctl.app.instructions import CSV_FILE
-from namod_ctl.app.overlay import PNG_FILE
-from namod_ctl.app.psf_maps import PSF_MAPS_FILE, draw_psf_maps
-from namod_ctl.app.psf_panels import psf_panels
+from namod_ctl.app.config.instrument import InstrumentConfig
+from namod_ctl.app.pictures.figure_style import figure_to_png
+from namod_ctl.app.pictures.figures import EXPOSURE_MAP_FILE, PSF_SUM_FILE, draw_exposure_map, draw_psf_sum
+from namod_ctl.app.pictures.psf_maps import PSF_MAPS_FILE, draw_psf_maps
+from namod_ctl.app.pictures.psf_panels import psf_panels
 from namod_ctl.app.reconstruction_report import REPORT_FILE, halves_text, report_text
+from namod_ctl.app.sheets.instructions import CSV_FILE
+from namod_ctl.app.sheets.ladder_sheets import PDF_FILE
+from namod_ctl.app.sheets.overlay import PNG_FILE
 from namod_ctl.core.clock import Clock, SystemClock
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.units import deg_to_rad

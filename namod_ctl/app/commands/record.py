@@ -16,15 +16,15 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from namod_ctl.app.bench_sky import twin_equipment
-from namod_ctl.app.build import build_instrument
-from namod_ctl.app.build_recording import build_record_settings
-from namod_ctl.app.build_sky_session import open_sky_session
-from namod_ctl.app.build_twin import build_twin, load_twin_settings, with_facet_map
-from namod_ctl.app.config import InstrumentConfig, load_config
+from namod_ctl.app.build.bench_sky import twin_equipment
+from namod_ctl.app.build.instrument import build_instrument
+from namod_ctl.app.build.recording import build_record_settings
+from namod_ctl.app.build.sky_session import open_sky_session
+from namod_ctl.app.build.twin import build_twin, load_twin_settings, with_facet_map
+from namod_ctl.app.build.twin_note import different_sections, note_twin, noted_twin
+from namod_ctl.app.config.instrument import InstrumentConfig, load_config
 from namod_ctl.app.dashboard.beside import dashboard_beside
-from namod_ctl.app.terminal import TerminalView
-from namod_ctl.app.twin_note import different_sections, note_twin, noted_twin
+from namod_ctl.app.views.recording_view import TerminalView
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.flags import REJECT_REASON_MEANING

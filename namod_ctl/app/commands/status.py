@@ -12,7 +12,7 @@ import typer
 from rich.console import Console
 
 from namod_ctl.app.campaign_choice import CAMPAIGN_HELP, choose_campaign
-from namod_ctl.app.number_ranges import counted, legs_in_words, runs_in_words
+from namod_ctl.app.views.number_ranges import counted, legs_in_words, runs_in_words
 from namod_ctl.core.drives import Leg
 from namod_ctl.core.motion import MoveOutcome
 from namod_ctl.core.units import rad2_to_arcmin2

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from namod_ctl.app.build import build_instrument
-from namod_ctl.app.build_twin import with_facet_map
-from namod_ctl.app.config import InstrumentConfig
+from namod_ctl.app.build.instrument import build_instrument
+from namod_ctl.app.build.twin import with_facet_map
+from namod_ctl.app.config.instrument import InstrumentConfig
 from namod_ctl.app.dashboard.numbers import short, shorts
 from namod_ctl.core.flags import FACET_FLAG_MEANING
 from namod_ctl.core.units import rad2_to_arcmin2, rad_to_arcmin, rad_to_deg

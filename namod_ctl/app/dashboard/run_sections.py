@@ -11,10 +11,10 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from namod_ctl.app.build_recording import build_record_settings
-from namod_ctl.app.config import InstrumentConfig
+from namod_ctl.app.build.recording import build_record_settings
+from namod_ctl.app.config.instrument import InstrumentConfig
 from namod_ctl.app.dashboard.numbers import short, shorts
-from namod_ctl.app.terminal import star_brightness, steering
+from namod_ctl.app.views.recording_view import star_brightness, steering
 from namod_ctl.core.flags import REJECT_REASON_MEANING, RejectReason
 from namod_ctl.core.units import rad2_to_arcmin2, rad_to_arcmin, rad_to_deg
 from namod_ctl.cycle.live_status import NOTE_LIVE, LiveStatus

@@ -17,7 +17,7 @@ from typing import Any, Final, Self
 
 from namod_ctl import __version__
 from namod_ctl.app.alignment_files import alignment_from_json
-from namod_ctl.app.config import InstrumentConfig
+from namod_ctl.app.config.instrument import InstrumentConfig
 from namod_ctl.app.dashboard import campaign_sections, facet_sections
 from namod_ctl.app.dashboard.run_sections import RunGlance, estimate_of
 from namod_ctl.core.errors import ConfigError, NamodError, StoreError

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from namod_ctl.app.facet_map import outlines_m
-from namod_ctl.app.instruction_sheets import plan_sheets, turn_in_words
-from namod_ctl.app.instructions import FacetInstruction, Verdict, facet_instructions
+from namod_ctl.app.sheets.facet_map import outlines_m
+from namod_ctl.app.sheets.instructions import FacetInstruction, Verdict, facet_instructions
+from namod_ctl.app.sheets.ladder_sheets import plan_sheets, turn_in_words
 from namod_ctl.optics.instrument import Instrument
 from namod_ctl.optics.mounts import Mount
 from namod_ctl.reconstruction.alignment import Alignment

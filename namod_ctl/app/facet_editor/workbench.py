@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from namod_ctl.app.build import build_instrument
-from namod_ctl.app.config import builtin_folder, find_config, load_config
-from namod_ctl.app.config_extends import read_extended
-from namod_ctl.app.overlay import scale_polygons
+from namod_ctl.app.build.instrument import build_instrument
+from namod_ctl.app.config.extends import read_extended
+from namod_ctl.app.config.instrument import builtin_folder, find_config, load_config
+from namod_ctl.app.sheets.overlay import scale_polygons
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.units import deg_to_rad
 from namod_ctl.imaging.facet_edges import EdgePicture, Proposal, propose_from_marks, propose_without_marks

@@ -11,14 +11,14 @@ from multiprocessing import get_context
 
 import typer
 
-from namod_ctl.app.camera_choice import ChosenCamera
-from namod_ctl.app.camera_views import Look
+from namod_ctl.app.build.camera_choice import ChosenCamera
 from namod_ctl.app.dashboard.guard import is_loopback
 from namod_ctl.app.dashboard.server import listen
 from namod_ctl.app.focus_page.cutout import FIRST_PX, cutout, cutout_side_px
 from namod_ctl.app.focus_page.frame_news import news_of
 from namod_ctl.app.focus_page.news import packed
 from namod_ctl.app.focus_page.server import serve
+from namod_ctl.app.views.camera_views import Look
 from namod_ctl.cycle.focus import FocusReading
 
 ENDS_WITHIN_S = 3.0

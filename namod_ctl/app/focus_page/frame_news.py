@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from namod_ctl.app.camera_choice import ChosenCamera
-from namod_ctl.app.camera_views import Look
+from namod_ctl.app.build.camera_choice import ChosenCamera
 from namod_ctl.app.dashboard.numbers import short
 from namod_ctl.app.focus_page.news import FocusNews
+from namod_ctl.app.views.camera_views import Look
 from namod_ctl.core.units import rad_to_arcmin
 from namod_ctl.cycle.focus import FocusReading
 from namod_ctl.imaging.exposure import ExposureVerdict

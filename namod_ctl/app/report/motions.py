@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from namod_ctl.app.build_correctors import GONIOMETER_SIGMA_RAD
+from namod_ctl.app.build.correctors import GONIOMETER_SIGMA_RAD
 from namod_ctl.app.report.document import Chapter, Table, Text
 from namod_ctl.app.report.parts import number_text
 from namod_ctl.core.motion import MoveOutcome

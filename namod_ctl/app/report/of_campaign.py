@@ -11,12 +11,12 @@ import numpy as np
 
 from namod_ctl import __version__
 from namod_ctl.app.alignment_files import alignment_from_json
-from namod_ctl.app.build import build_instrument
+from namod_ctl.app.build.instrument import build_instrument
 from namod_ctl.app.campaign_report import draw_history
 from namod_ctl.app.commands.align import NOTE_WISHES
-from namod_ctl.app.config import InstrumentConfig
-from namod_ctl.app.figures import draw_psf_sum
-from namod_ctl.app.psf_panels import measured_panels
+from namod_ctl.app.config.instrument import InstrumentConfig
+from namod_ctl.app.pictures.figures import draw_psf_sum
+from namod_ctl.app.pictures.psf_panels import measured_panels
 from namod_ctl.app.report.document import Block, Chapter, Document, Picture, Table, Text
 from namod_ctl.app.report.journal import fault_chapter, journal_chapter
 from namod_ctl.app.report.motions import motion_chapters

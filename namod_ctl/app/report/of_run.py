@@ -7,10 +7,10 @@ from pathlib import Path
 
 from namod_ctl import __version__
 from namod_ctl.app.alignment_files import ALIGNMENT_FILE, read_alignment
-from namod_ctl.app.build import build_instrument
-from namod_ctl.app.config import InstrumentConfig
-from namod_ctl.app.figures import draw_psf_sum
-from namod_ctl.app.psf_panels import psf_panels
+from namod_ctl.app.build.instrument import build_instrument
+from namod_ctl.app.config.instrument import InstrumentConfig
+from namod_ctl.app.pictures.figures import draw_psf_sum
+from namod_ctl.app.pictures.psf_panels import psf_panels
 from namod_ctl.app.report.document import Block, Chapter, Document, Picture, Table, Text
 from namod_ctl.app.report.parts import (
     area_text,

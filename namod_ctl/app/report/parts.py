@@ -11,11 +11,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image
 
-from namod_ctl.app.config import InstrumentConfig
-from namod_ctl.app.config_summary import summarize, warnings_of
-from namod_ctl.app.figure_style import figure_to_png
-from namod_ctl.app.figures import draw_exposure_map
-from namod_ctl.app.psf_maps import draw_psf_maps
+from namod_ctl.app.config.instrument import InstrumentConfig
+from namod_ctl.app.config.summary import summarize, warnings_of
+from namod_ctl.app.pictures.figure_style import figure_to_png
+from namod_ctl.app.pictures.figures import draw_exposure_map
+from namod_ctl.app.pictures.psf_maps import draw_psf_maps
 from namod_ctl.app.report.document import Block, Chapter, Picture, Table, Text
 from namod_ctl.core.flags import FACET_FLAG_MEANING, REJECT_REASON_MEANING, FacetFlag
 from namod_ctl.core.records import Record

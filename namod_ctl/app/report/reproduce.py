@@ -8,10 +8,10 @@ import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from namod_ctl.app.config import InstrumentConfig, builtin_names, load_config
+from namod_ctl.app.build.twin_note import NOTE_SETTINGS, Notes, different_sections, noted_twin
+from namod_ctl.app.config.instrument import InstrumentConfig, builtin_names, load_config
 from namod_ctl.app.report.document import Block, Chapter, Listing, Text
 from namod_ctl.app.report.toml_text import to_toml
-from namod_ctl.app.twin_note import NOTE_SETTINGS, Notes, different_sections, noted_twin
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.twin.settings import TwinSettings
 

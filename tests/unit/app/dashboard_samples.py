@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from namod_ctl.app.config import InstrumentConfig, load_config
+from namod_ctl.app.config.instrument import InstrumentConfig, load_config
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.flags import RejectReason
 from namod_ctl.core.records import Record

@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from namod_ctl.app.camera_choice import ChosenCamera
-from namod_ctl.app.camera_views import Look
+from namod_ctl.app.build.camera_choice import ChosenCamera
 from namod_ctl.app.focus_page.beside import FocusPage
+from namod_ctl.app.views.camera_views import Look
 from namod_ctl.core.clock import SystemMonotonicClock
 from namod_ctl.core.interfaces import Exposure
 from namod_ctl.core.units import arcmin_to_rad

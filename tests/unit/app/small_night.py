@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from namod_ctl.app.build_recording import build_record_settings
-from namod_ctl.app.build_twin import build_twin
-from namod_ctl.app.build_twin_campaign import open_twin_campaign
+from namod_ctl.app.build.recording import build_record_settings
+from namod_ctl.app.build.twin import build_twin
+from namod_ctl.app.build.twin_campaign import open_twin_campaign
+from namod_ctl.app.build.twin_note import note_twin
 from namod_ctl.app.commands.reconstruct import reconstruct_run
-from namod_ctl.app.config import InstrumentConfig, load_config
-from namod_ctl.app.twin_note import note_twin
+from namod_ctl.app.config.instrument import InstrumentConfig, load_config
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.motion import StopSwitch
 from namod_ctl.core.units import arcmin_to_rad, deg_to_rad

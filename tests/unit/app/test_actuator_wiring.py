@@ -5,8 +5,8 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from namod_ctl.app.actuator_schema import AXES, ActuatorsSection
-from namod_ctl.app.actuator_wiring import wires_of
+from namod_ctl.app.config.actuator_schema import AXES, ActuatorsSection
+from namod_ctl.app.config.actuator_wiring import wires_of
 from namod_ctl.core.drives import Leg
 
 

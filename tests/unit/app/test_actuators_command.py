@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from typer.testing import CliRunner, Result
 
-from namod_ctl.app.actuator_tables import legs_named
 from namod_ctl.app.cli import app
+from namod_ctl.app.views.actuator_tables import legs_named
 from namod_ctl.core.drives import Leg
 from namod_ctl.core.errors import ConfigError
 

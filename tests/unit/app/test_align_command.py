@@ -8,8 +8,8 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from namod_ctl.app.align_view import AlignView
 from namod_ctl.app.commands.align import align
+from namod_ctl.app.views.align_view import AlignView
 from namod_ctl.cycle.live_status import NOTE_LIVE, LiveStatus
 from namod_ctl.cycle.progress import Progress
 from namod_ctl.store.live_pictures import live_pictures

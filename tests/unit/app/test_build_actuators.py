@@ -9,10 +9,10 @@ import pytest
 import serial  # type: ignore[import-untyped]
 
 from namod_ctl.app import cli
-from namod_ctl.app.build_actuators import build_bus_settings, open_actuators
-from namod_ctl.app.build_twin import build_twin
-from namod_ctl.app.build_twin_actuators import build_twin_actuators, twin_wiring
-from namod_ctl.app.config import InstrumentConfig, builtin_names, load_config
+from namod_ctl.app.build.actuators import build_bus_settings, open_actuators
+from namod_ctl.app.build.twin import build_twin
+from namod_ctl.app.build.twin_actuators import build_twin_actuators, twin_wiring
+from namod_ctl.app.config.instrument import InstrumentConfig, builtin_names, load_config
 from namod_ctl.core.drives import Leg
 from namod_ctl.core.errors import CommunicationError, ConfigError
 from namod_ctl.core.units import um_to_m

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from namod_ctl.app.build_cameras import CAMERA_CLASSES, camera_settings, has_cameras, open_cameras
-from namod_ctl.app.build_sky_session import open_sky_session
-from namod_ctl.app.camera_schema import KEYS_OF_DRIVER
-from namod_ctl.app.config import InstrumentConfig, load_config
+from namod_ctl.app.build.cameras import CAMERA_CLASSES, camera_settings, has_cameras, open_cameras
+from namod_ctl.app.build.sky_session import open_sky_session
+from namod_ctl.app.config.camera_schema import KEYS_OF_DRIVER
+from namod_ctl.app.config.instrument import InstrumentConfig, load_config
 from namod_ctl.core.clock import SystemMonotonicClock
 from namod_ctl.core.errors import ConfigError, DeviceFaultError
 from namod_ctl.store.run import RunStore
@@ -200,7 +200,7 @@ def test_drivers_are_loaded_without_the_libraries_of_makers() -> None:
     """Whoever has one maker's camera needs the library of none of the others."""
     look = """
 import importlib, sys
-from namod_ctl.app.build_cameras import CAMERA_CLASSES
+from namod_ctl.app.build.cameras import CAMERA_CLASSES
 for driver, name in CAMERA_CLASSES.items():
     module = importlib.import_module(f"namod_ctl.devices.cameras.{driver}_camera")
     assert callable(getattr(module, name)) and callable(module.list_cameras), driver

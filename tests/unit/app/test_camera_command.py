@@ -22,10 +22,10 @@ from astropy.io import fits
 from typer.testing import CliRunner, Result
 
 import namod_ctl.app.commands.camera as command
-from namod_ctl.app.camera_choice import ChosenCamera, open_chosen
-from namod_ctl.app.camera_views import LOST, Watch, dropped_text, focus_line, write_frame
+from namod_ctl.app.build.camera_choice import ChosenCamera, open_chosen
 from namod_ctl.app.cli import app
-from namod_ctl.app.config import builtin_folder
+from namod_ctl.app.config.instrument import builtin_folder
+from namod_ctl.app.views.camera_views import LOST, Watch, dropped_text, focus_line, write_frame
 from namod_ctl.core.errors import CommunicationError, ConfigError, DeviceFaultError, NamodError
 from namod_ctl.core.interfaces import Exposure
 from namod_ctl.cycle.focus import FocusReading

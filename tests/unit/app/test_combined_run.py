@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from namod_ctl.app.build import build_instrument
-from namod_ctl.app.build_twin import build_twin, with_facet_map
+from namod_ctl.app.build.instrument import build_instrument
+from namod_ctl.app.build.twin import build_twin, with_facet_map
+from namod_ctl.app.build.twin_note import note_twin
 from namod_ctl.app.cli import main
-from namod_ctl.app.config import InstrumentConfig, load_config
-from namod_ctl.app.twin_note import note_twin
+from namod_ctl.app.config.instrument import InstrumentConfig, load_config
 from namod_ctl.core.records import Record
 from namod_ctl.core.units import arcmin_to_rad, deg_to_rad
 from namod_ctl.cycle.record import Equipment, Recorder, RecordSettings, StopRule

@@ -13,7 +13,7 @@ from small_night import FACET_IDS, record, small_config, small_twin
 from typer.testing import CliRunner
 
 from namod_ctl.app.cli import app
-from namod_ctl.app.drift_table import drift_csv, drift_summary
+from namod_ctl.app.views.drift_table import drift_csv, drift_summary
 from namod_ctl.core.errors import ConfigError, DataQualityError
 from namod_ctl.core.flags import FacetFlag
 from namod_ctl.core.units import arcmin_to_rad, rad_to_arcmin

@@ -13,8 +13,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from namod_ctl.app.build import build_instrument
-from namod_ctl.app.config import InstrumentConfig, builtin_folder, builtin_names, load_config
+from namod_ctl.app.build.instrument import build_instrument
+from namod_ctl.app.config.instrument import InstrumentConfig, builtin_folder, builtin_names, load_config
 from namod_ctl.core.errors import ConfigError
 
 FACT_TOML = (builtin_folder() / "fact.toml").read_text()

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from namod_ctl.app import cli
-from namod_ctl.app.build_actuators import build_bus_settings, build_motion_settings
-from namod_ctl.app.config import InstrumentConfig, builtin_folder, load_config
+from namod_ctl.app.build.actuators import build_bus_settings, build_motion_settings
+from namod_ctl.app.config.instrument import InstrumentConfig, builtin_folder, load_config
 from namod_ctl.core.drives import Leg
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.motion_settings import MotionSettings

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from namod_ctl.app import cli
-from namod_ctl.app.config import builtin_folder, builtin_names
+from namod_ctl.app.config.instrument import builtin_folder, builtin_names
 
 
 def _run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:

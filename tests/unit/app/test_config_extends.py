@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from namod_ctl.app.config import builtin_folder, load_config
+from namod_ctl.app.config.instrument import builtin_folder, load_config
 from namod_ctl.core.errors import ConfigError
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from namod_ctl.app.build import build_instrument
-from namod_ctl.app.config import load_config
+from namod_ctl.app.build.instrument import build_instrument
+from namod_ctl.app.config.instrument import load_config
 from namod_ctl.optics.instrument import Instrument
 from namod_ctl.optics.reflector import FacetShape
 

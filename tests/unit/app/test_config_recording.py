@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from namod_ctl.app.build_recording import build_record_settings
-from namod_ctl.app.config import InstrumentConfig, builtin_folder, load_config
+from namod_ctl.app.build.recording import build_record_settings
+from namod_ctl.app.config.instrument import InstrumentConfig, builtin_folder, load_config
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.cycle.record import RecordSettings
 

@@ -13,10 +13,10 @@ from drivers_that_misbehave import write_drivers
 from typer.testing import CliRunner
 
 import namod_ctl.app.commands.devices as command
-from namod_ctl.app.camera_listing import DriverListing, list_all_cameras
 from namod_ctl.app.cli import app
-from namod_ctl.app.config import builtin_folder, load_config
-from namod_ctl.app.device_tables import Inventory, WantedDevice, answering_servers, as_json, wanted_devices
+from namod_ctl.app.config.instrument import builtin_folder, load_config
+from namod_ctl.app.views.camera_listing import DriverListing, list_all_cameras
+from namod_ctl.app.views.device_tables import Inventory, WantedDevice, answering_servers, as_json, wanted_devices
 from namod_ctl.devices.cameras.found import FoundCamera
 from namod_ctl.devices.ports import FoundPort
 from namod_ctl.devices.usb_tree import UsbDevice, UsbKind, UsbSpeed, UsbTree

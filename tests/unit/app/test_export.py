@@ -13,10 +13,10 @@ from astropy.table import QTable
 from output_samples import alignment_of, facet_alignment, tripod, unknown_facet
 
 from namod_ctl.app.alignment_files import write_alignment
-from namod_ctl.app.build import build_instrument
+from namod_ctl.app.build.instrument import build_instrument
 from namod_ctl.app.cli import main
 from namod_ctl.app.commands.export import estimated_normals
-from namod_ctl.app.config import load_config
+from namod_ctl.app.config.instrument import load_config
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.flags import FacetFlag
 from namod_ctl.core.records import Record

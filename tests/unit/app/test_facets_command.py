@@ -17,7 +17,7 @@ from facet_editor_rig import truth, write_picture
 from typer.testing import CliRunner
 
 from namod_ctl.app.cli import app
-from namod_ctl.app.config import builtin_folder, load_config
+from namod_ctl.app.config.instrument import builtin_folder, load_config
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.store.facet_tables import read_polygon_table
 

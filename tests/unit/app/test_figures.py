@@ -8,9 +8,9 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from output_samples import FACT_DATA, alignment_of, facet_alignment, fact_response_table, honeycomb, random_alignment
 
-from namod_ctl.app.figure_style import ellipse_axes, figure_to_png
-from namod_ctl.app.figures import PsfPanel, draw_exposure_map, draw_psf_sum
-from namod_ctl.app.psf_maps import draw_psf_maps
+from namod_ctl.app.pictures.figure_style import ellipse_axes, figure_to_png
+from namod_ctl.app.pictures.figures import PsfPanel, draw_exposure_map, draw_psf_sum
+from namod_ctl.app.pictures.psf_maps import draw_psf_maps
 from namod_ctl.core.flags import FacetFlag
 from namod_ctl.core.units import deg_to_rad
 from namod_ctl.reconstruction.alignment import AreaOfPsf, BadRecord

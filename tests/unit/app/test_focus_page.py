@@ -28,7 +28,6 @@ from hypothesis import strategies as st
 from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
-from namod_ctl.app.camera_views import Look
 from namod_ctl.app.cli import app
 from namod_ctl.app.dashboard.guard import Rules
 from namod_ctl.app.focus_page.beside import focus_page_beside
@@ -38,6 +37,7 @@ from namod_ctl.app.focus_page.frame_news import news_of
 from namod_ctl.app.focus_page.news import FocusNews, packed, unpacked
 from namod_ctl.app.focus_page.server import OF_THE_LIVE_PAGE, build_app
 from namod_ctl.app.focus_page.trend import Trend, trend
+from namod_ctl.app.views.camera_views import Look
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.cycle.focus import FocusCourse, read_focus
 from namod_ctl.imaging.exposure import ExposureVerdict

@@ -24,14 +24,14 @@ from output_samples import (
     unknown_facet,
 )
 
-from namod_ctl.app.instruction_sheets import (
+from namod_ctl.app.sheets.instructions import Verdict, facet_instructions, instructions_to_csv, settable_turn_deg
+from namod_ctl.app.sheets.ladder_sheets import (
     MOST_FACETS_PER_SHEET,
     _pages,
     plan_sheets,
     sheets_to_pdf,
     turn_in_words,
 )
-from namod_ctl.app.instructions import Verdict, facet_instructions, instructions_to_csv, settable_turn_deg
 from namod_ctl.core.flags import FacetFlag
 from namod_ctl.core.units import deg_to_rad, rad_to_deg
 

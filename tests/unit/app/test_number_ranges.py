@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from namod_ctl.app.number_ranges import counted, legs_in_words, runs_in_words
+from namod_ctl.app.views.number_ranges import counted, legs_in_words, runs_in_words
 from namod_ctl.core.drives import Leg
 
 

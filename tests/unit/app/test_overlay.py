@@ -19,9 +19,9 @@ from output_samples import (
     tripod,
 )
 
-from namod_ctl.app.facet_map import locate_facets, polygon_area, polygon_centre, polygons_of_facet_list
-from namod_ctl.app.instructions import facet_instructions
-from namod_ctl.app.overlay import draw_instructions, scale_polygons
+from namod_ctl.app.sheets.facet_map import locate_facets, polygon_area, polygon_centre, polygons_of_facet_list
+from namod_ctl.app.sheets.instructions import facet_instructions
+from namod_ctl.app.sheets.overlay import draw_instructions, scale_polygons
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.flags import FacetFlag
 from namod_ctl.core.units import deg_to_rad

@@ -14,7 +14,7 @@ from astropy.table import QTable
 
 from namod_ctl.app.alignment_files import read_alignment
 from namod_ctl.app.cli import main
-from namod_ctl.app.config import load_config
+from namod_ctl.app.config.instrument import load_config
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.records import Record, RejectReason
 from namod_ctl.store.run import RunStore

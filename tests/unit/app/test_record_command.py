@@ -10,11 +10,11 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from namod_ctl.app.build_twin import build_twin, load_twin_settings
+from namod_ctl.app.build.twin import build_twin, load_twin_settings
+from namod_ctl.app.build.twin_note import noted_twin
 from namod_ctl.app.commands.record import record
-from namod_ctl.app.config import builtin_folder, load_config
-from namod_ctl.app.terminal import TerminalView
-from namod_ctl.app.twin_note import noted_twin
+from namod_ctl.app.config.instrument import builtin_folder, load_config
+from namod_ctl.app.views.recording_view import TerminalView
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.errors import NamodError, StoreError
 from namod_ctl.cycle.control import Request, RequestKind, send

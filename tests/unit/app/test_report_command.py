@@ -15,15 +15,15 @@ from hypothesis import strategies as st
 from small_night import FACET_IDS, SEED, manual_campaign, small_config, small_twin
 from typer.testing import CliRunner
 
-from namod_ctl.app.build_twin import load_twin_settings
+from namod_ctl.app.build.twin import load_twin_settings
+from namod_ctl.app.build.twin_note import note_twin, noted_twin
 from namod_ctl.app.cli import app
 from namod_ctl.app.commands.align import NOTE_WISHES
-from namod_ctl.app.config import builtin_names, load_config
+from namod_ctl.app.config.instrument import builtin_names, load_config
 from namod_ctl.app.report.document import Chapter, Document, Listing, Picture, Table, Text
 from namod_ctl.app.report.html_page import to_html
 from namod_ctl.app.report.pdf_pages import to_pdf
 from namod_ctl.app.report.toml_text import to_toml
-from namod_ctl.app.twin_note import note_twin, noted_twin
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.drives import Leg
 from namod_ctl.core.motion import MoveOrder, MoveOutcome, MoveResult

@@ -12,8 +12,8 @@ import pytest
 from output_samples import alignment_of, facet_alignment, honeycomb, instrument_of, tripod, unknown_facet
 
 from namod_ctl.app.dashboard.work_sheet import work_sheet
-from namod_ctl.app.instruction_sheets import _pages, plan_sheets
-from namod_ctl.app.instructions import facet_instructions
+from namod_ctl.app.sheets.instructions import facet_instructions
+from namod_ctl.app.sheets.ladder_sheets import _pages, plan_sheets
 from namod_ctl.core.flags import FacetFlag
 from namod_ctl.optics.instrument import Instrument
 from namod_ctl.reconstruction.alignment import Alignment

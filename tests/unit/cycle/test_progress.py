@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from namod_ctl.app.terminal import TerminalView, coverage_lines, plain_line, star_brightness, steering
+from namod_ctl.app.views.recording_view import TerminalView, coverage_lines, plain_line, star_brightness, steering
 from namod_ctl.core.flags import RejectReason
 from namod_ctl.core.records import Record
 from namod_ctl.cycle.coverage import N_CELLS, empty_coverage, with_record

@@ -9,8 +9,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from namod_ctl.app.build_twin import build_twin
-from namod_ctl.app.config import InstrumentConfig, load_config
+from namod_ctl.app.build.twin import build_twin
+from namod_ctl.app.config.instrument import InstrumentConfig, load_config
 from namod_ctl.core.interfaces import Camera
 from namod_ctl.cycle.pairs import SourceStatus
 from namod_ctl.cycle.progress import Progress, Tracker

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from namod_ctl.app.alignment_files import alignment_from_json, alignment_to_json
-from namod_ctl.app.build import build_instrument
-from namod_ctl.app.config import load_config
+from namod_ctl.app.build.instrument import build_instrument
+from namod_ctl.app.config.instrument import load_config
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.motion import StopSwitch

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from namod_ctl.app.build import build_instrument
-from namod_ctl.app.config import builtin_folder, load_config
+from namod_ctl.app.build.instrument import build_instrument
+from namod_ctl.app.config.instrument import builtin_folder, load_config
 from namod_ctl.core.units import arcmin_to_rad, deg_to_rad
 from namod_ctl.optics.instrument import Instrument
 from namod_ctl.optics.polygons import clip_to_image

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from namod_ctl.app.cli import app
-from namod_ctl.app.config import load_config
+from namod_ctl.app.config.instrument import load_config
 from namod_ctl.core.errors import ConfigError, NamodError
 from namod_ctl.store.response_maps import HEADER, parse_response_map, pixel_grid_step_rad
 from namod_ctl.store.run import RunStore

@@ -13,9 +13,9 @@ from namod_files import FACET_IDS_AS_WRITTEN, STAMP, TrueRecord, int_file, refle
 from PIL import Image
 from typer.testing import CliRunner
 
-from namod_ctl.app.build import build_instrument
+from namod_ctl.app.build.instrument import build_instrument
 from namod_ctl.app.cli import app
-from namod_ctl.app.config import InstrumentConfig
+from namod_ctl.app.config.instrument import InstrumentConfig
 from namod_ctl.core.errors import ConfigError, NamodError, StoreError
 from namod_ctl.core.flags import RejectReason
 from namod_ctl.core.records import Record

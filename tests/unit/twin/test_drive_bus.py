@@ -14,8 +14,8 @@ from drive_twins import BUS, STEP_M, some_drives
 from test_drive_protocols import tmcl
 from twins import CALM, STILL, pair, small_config
 
-from namod_ctl.app.build import build_instrument
-from namod_ctl.app.build_twin import build_twin, with_facet_map
+from namod_ctl.app.build.instrument import build_instrument
+from namod_ctl.app.build.twin import build_twin, with_facet_map
 from namod_ctl.core.drives import Leg
 from namod_ctl.core.errors import CommunicationError, ConfigError
 from namod_ctl.core.units import mm_to_m, um_to_m

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from twins import aligned_twin, small_config, small_twin
 
-from namod_ctl.app.build import build_instrument
+from namod_ctl.app.build.instrument import build_instrument
 from namod_ctl.core.units import arcmin_to_rad, deg_to_rad, rad_to_arcmin
 from namod_ctl.optics.raytrace import a_sigma_rad2, combine_moments, facet_moments, tilted_normals, trace
 from namod_ctl.optics.reflector import Reflector

@@ -11,8 +11,8 @@ from typing import get_args, get_type_hints
 
 import pytest
 
-from namod_ctl.app.build_twin import build_twin, load_twin_settings
-from namod_ctl.app.config import load_config
+from namod_ctl.app.build.twin import build_twin, load_twin_settings
+from namod_ctl.app.config.instrument import load_config
 from namod_ctl.core.errors import CommunicationError, ConfigError, DeviceFaultError
 from namod_ctl.core.units import arcmin_to_rad, deg_to_rad
 from namod_ctl.twin.faults import CATALOGUE, DRIVE_CATALOGUE

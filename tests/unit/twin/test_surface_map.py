@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from namod_ctl.app.build import build_instrument
-from namod_ctl.app.build_twin import project_polygons, with_facet_map
-from namod_ctl.app.config import load_config
+from namod_ctl.app.build.instrument import build_instrument
+from namod_ctl.app.build.twin import project_polygons, with_facet_map
+from namod_ctl.app.config.instrument import load_config
 from namod_ctl.optics.coordinates import CameraOrientation
 from namod_ctl.optics.polygons import polygon_fault
 from namod_ctl.twin.facet_surface import N_RAYS, seen_samples

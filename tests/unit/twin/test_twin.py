@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from twins import CALM, STILL, aligned_twin, pair, quiet, small_twin
 
-from namod_ctl.app.build_twin import build_twin
-from namod_ctl.app.config import load_config
+from namod_ctl.app.build.twin import build_twin
+from namod_ctl.app.config.instrument import load_config
 from namod_ctl.core.errors import CommunicationError, ConfigError, DeviceFaultError
 from namod_ctl.core.interfaces import Camera
 from namod_ctl.core.units import arcmin_to_rad, deg_to_rad

@@ -20,8 +20,8 @@ from drive_twins import BUS, register_map
 from test_drive_protocols import tmcl
 from twins import CALM, STILL, small_config
 
-from namod_ctl.app.build import build_instrument
-from namod_ctl.app.build_twin import with_facet_map
+from namod_ctl.app.build.instrument import build_instrument
+from namod_ctl.app.build.twin import with_facet_map
 from namod_ctl.core.drives import Drive, Leg
 from namod_ctl.core.errors import ConfigError, StoreError
 from namod_ctl.core.units import mm_to_m

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from namod_ctl.app.build_twin import build_twin
-from namod_ctl.app.config import InstrumentConfig, load_config
+from namod_ctl.app.build.twin import build_twin
+from namod_ctl.app.config.instrument import InstrumentConfig, load_config
 from namod_ctl.core.units import arcmin_to_rad
 from namod_ctl.twin.settings import PERFECT, CameraSettings, FaultSpec, SkySettings, TwinSettings
 from namod_ctl.twin.twin import Twin

@@ -1,0 +1,1 @@
+"""Figures of point spread functions and their style."""
