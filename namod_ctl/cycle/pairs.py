@@ -39,6 +39,9 @@ PAIRS_AHEAD = 3
 
 LOST_CAMERA_RETRY_S = 1.0
 
+LOOK_S = 0.5
+"""Whoever waits for the next pair's moment looks so often whether the recording is to end."""
+
 
 class DropCause(StrEnum):
     """Why an image pair was dropped and taken again; the value is what a person reads."""
@@ -304,9 +307,8 @@ class PairSource:
         self._reflector.limit(longest_s)
         if self._next_start_s >= self.end_s:
             raise TimeIsUpError
-        early_s = self._next_start_s - self._clock.monotonic_s()
-        if early_s > 0.0 and not self._is_closing.is_set():
-            self._clock.wait_s(early_s)
+        while (early_s := self._next_start_s - self._clock.monotonic_s()) > 0.0 and not self._is_closing.is_set():
+            self._clock.wait_s(min(early_s, LOOK_S))
         self._next_start_s = max(self._next_start_s, self._clock.monotonic_s()) + self._pace_s
         while not self._is_closing.is_set():
             if self._clock.monotonic_s() >= self.end_s:

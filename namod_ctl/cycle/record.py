@@ -122,7 +122,8 @@ class StopRule:
         coverage = progress.coverage
         is_covered = not self.min_coverage or (coverage.share >= self.min_coverage and not coverage.has_hole)
         if self.n_records is not None and progress.n_accepted >= self.n_records * (1 if is_covered else MAX_FACTOR):
-            return "all records wanted are there"
+            is_more = self.min_coverage > 0.0 and progress.n_accepted > self.n_records
+            return "all records wanted are there" + (", and more to cover the region" if is_more else "")
         if self.uncertainty_rad is None or estimate is None or estimate.n_records < MIN_RECORDS_FOR_UNCERTAINTY:
             return ""
         unseen = estimate.unseen_facet_ids
@@ -227,6 +228,8 @@ class Recorder:
         progress = self.progress()
         reason = stop.reason_to_stop(progress)
         if reason:
+            for camera in (self._equipment.star_camera, self._equipment.reflector_camera):
+                camera.close()  # as after a recording: somebody opened them for this one
             return reason
         self._show(progress, "the first pair of frames", now=True)
         if stop.duration_s is not None:

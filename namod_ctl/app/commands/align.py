@@ -74,7 +74,12 @@ def align(
         Path | None, typer.Option("--resume", metavar="CAMPAIGN", help="Take up a campaign that was interrupted.")
     ] = None,
     records: Annotated[
-        int | None, typer.Option(min=50, help=f"Records per cycle.  [{DEFAULT_RECORDS}, or as begun]")
+        int | None,
+        typer.Option(
+            min=50,
+            help="Records per cycle at least; up to three times as many until the region is covered without a hole.  "
+            f"[{DEFAULT_RECORDS}, or as begun]",
+        ),
     ] = None,
     cycles: Annotated[
         int | None, typer.Option(min=1, help=f"Corrections at most.  [{DEFAULT_CYCLES}, or as begun]")

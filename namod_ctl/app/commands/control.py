@@ -9,6 +9,7 @@ from typing import Annotated, Literal, NoReturn
 import typer
 
 from namod_ctl.app.campaign_choice import CAMPAIGN_HELP, choose_campaign
+from namod_ctl.app.views.number_ranges import numbers_of_words
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.cycle.control import ALL, Answer, Request, RequestKind, SentRequest, send
@@ -107,7 +108,7 @@ def release(campaign: _Campaign = None) -> None:
 def done(
     campaign: _Campaign = None,
     facet: Annotated[
-        str | None, typer.Option("--facet", metavar="IDS", help="Facets whose bolts were turned, such as 13,31.")
+        str | None, typer.Option("--facet", metavar="IDS", help="Facets whose bolts were turned, such as 13,31,2-7.")
     ] = None,
     is_all: Annotated[bool, typer.Option("--all", help="All turns that were asked for are done.")] = False,
     undo: Annotated[
@@ -116,7 +117,7 @@ def done(
 ) -> None:
     """Say which of the turns that were asked for are done, or take it back.
 
-    Example: namod-ctl done CAMPAIGN --facet 13,31
+    Example: namod-ctl done CAMPAIGN --facet 13,31,2-7
     """
     if (facet is not None) == is_all:
         raise ConfigError("say either which facets are done (--facet 13,31) or that all are (--all)")
@@ -193,11 +194,10 @@ def _wait_for_answer(path: Path, sent: SentRequest) -> Answer | None:
 
 
 def _facet_ids(text: str) -> tuple[int, ...]:
-    words = [word.strip() for word in text.split(",")]
-    for word in words:
-        if not (word.isascii() and word.isdigit() and int(word) < 2**31):
-            raise ConfigError(f"--facet {text}: {word!r} is no facet id; give ids with commas between, such as 13,31")
-    return tuple(dict.fromkeys(int(word) for word in words))
+    try:
+        return numbers_of_words(text)
+    except ConfigError as problem:
+        raise ConfigError(f"--facet {text}: {problem}") from None
 
 
 def _refuse(why: str) -> NoReturn:

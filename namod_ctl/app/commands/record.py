@@ -29,14 +29,14 @@ from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.flags import REJECT_REASON_MEANING
 from namod_ctl.core.records import Record
-from namod_ctl.core.units import arcmin_to_rad, deg_to_rad
+from namod_ctl.core.units import arcmin_to_rad, arcsec_to_rad, deg_to_rad
 from namod_ctl.cycle.live_estimate import LiveEstimator
 from namod_ctl.cycle.progress import Progress
 from namod_ctl.cycle.record import SESSION_GAP_S, Equipment, Recorder, StopRule
 from namod_ctl.cycle.recording_control import RecordingControl
 from namod_ctl.cycle.replay import CAMERAS, ReplayCamera, ReplayClock, replayable_records
 from namod_ctl.optics.instrument import Instrument
-from namod_ctl.store.folders import check_output, discard, free_sibling, put_in_place
+from namod_ctl.store.folders import check_output, discard, free_sibling, is_run, put_in_place
 from namod_ctl.store.import_namod import KeepFrames
 from namod_ctl.store.run import RunStore
 from namod_ctl.store.run_lock import recording_lock
@@ -49,7 +49,7 @@ DEFAULT_SEED = 1
 MAX_MINUTES = 24.0 * 60.0  # no night is longer
 MAX_EVERY_S = 3600.0
 MAX_REGION_RADIUS_DEG = 5.0
-_ANGLE = re.compile(r"([0-9]*\.?[0-9]+)\s*(arcmin|deg)")
+_ANGLE = re.compile(r"([0-9]*\.?[0-9]+)\s*(arcsec|arcmin|deg)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,13 +210,19 @@ def _refuse_beyond(option: str, value: float | None, limit: float) -> None:
 def _angle_rad(text: str) -> float:
     match = _ANGLE.fullmatch(text.strip())
     if match is None or float(match[1]) <= 0.0:
-        raise ConfigError(f"--until-uncertainty {text}: give a positive angle with its unit, such as 0.3arcmin")
-    return arcmin_to_rad(float(match[1])) if match[2] == "arcmin" else deg_to_rad(float(match[1]))
+        raise ConfigError(f"--until-uncertainty {text}: give a positive angle in arcsec, arcmin or deg: 0.3arcmin")
+    to_rad = {"arcsec": arcsec_to_rad, "arcmin": arcmin_to_rad, "deg": deg_to_rad}[match[2]]
+    return to_rad(float(match[1]))
 
 
 def _refuse_unclear_goal(out: Path | None, append: Path | None, *, force: bool) -> None:
     if (out is None) == (append is None):
         raise ConfigError("say where the records go: --out for a new run, or --append RUN to go on with one")
+    if out is not None and not force and is_run(out):
+        raise ConfigError(
+            f"{out}: holds a run already; go on with it by namod-ctl record --append {out}, choose another --out, or "
+            "replace it with --force"
+        )
     if append is not None and force:
         raise ConfigError(f"--append {append}: goes on with that run, --force would replace one; leave one of them out")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import select
 import sys
 from collections.abc import Sequence
@@ -12,7 +13,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from namod_ctl.app.views.number_ranges import counted, numbers_of_words
 from namod_ctl.app.views.recording_view import TerminalView
+from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.units import m_to_mm, rad2_to_arcmin2
 from namod_ctl.cycle.campaign_parts import View
 from namod_ctl.cycle.machine import STATES
@@ -66,16 +69,16 @@ class AlignView(View):
         travels_mm = [abs(m_to_mm(order.target_m - order.start_m)) for order in plan.orders]
         if travels_mm:
             self._line(
-                f"{len(plan.orders)} legs of {len(plan.turned)} facets, up to {max(travels_mm):.3f} mm; predicted "
+                f"{counted(len(plan.orders), 'leg')} of {counted(len(plan.turned), 'facet')}, up to {max(travels_mm):.3f} mm; predicted "
                 f"{rad2_to_arcmin2(plan.forecast.a_sigma_rad2):.2f} arcmin2"
             )
         else:
-            self._line(f"{len(plan.turned)} facets to turn by hand")
+            self._line(f"{counted(len(plan.turned), 'facet')} to turn by hand")
         for facet_id, why in list(plan.refused.items())[:MAX_REFUSED_SHOWN]:
             self._line(f"facet {facet_id} stays as it is: {why}")
         if len(plan.refused) > MAX_REFUSED_SHOWN:
             self._line(
-                f"and {len(plan.refused) - MAX_REFUSED_SHOWN} more stay as they are; namod-ctl status lists them"
+                f"not turned either: {len(plan.refused) - MAX_REFUSED_SHOWN} more; namod-ctl status lists them"
             )
 
     def told(self, text: str) -> None:
@@ -88,16 +91,16 @@ class AlignView(View):
         return None if text is None else text.lower() in ("y", "yes")
 
     def turned(self) -> Sequence[int] | Literal["all"]:
-        """What the person at this terminal types: ids of facets with commas between, or all, and Enter."""
-        text = self._typed("which facets are turned? [13,31 or all] (or `namod-ctl done` elsewhere) ")
+        """What the person at this terminal types: ids of facets with commas between, 2-7 for a run, or all, and Enter."""
+        text = self._typed("which facets are turned? [13,31,2-7 or all] (or `namod-ctl done` elsewhere) ")
         if not text:
             return ()
         if text.lower() == "all":
             return "all"
-        words = [word.strip() for word in text.split(",")]
-        if all(word.isascii() and word.isdigit() for word in words):
-            return [int(word) for word in words]
-        self._line(f"{text!r}: type ids of facets with commas between, such as 13,31, or all")
+        try:
+            return numbers_of_words(text)
+        except ConfigError as problem:
+            self._line(f"{problem}; or all")
         return ()
 
     def wait(self) -> None:
@@ -133,14 +136,14 @@ def cycle_table(cycles: list[Cycle]) -> Table:
         table.add_column(name, justify="left" if name == "decision" else "right")
     for cycle in cycles:
         now, doubt, predicted = (
-            rad2_to_arcmin2(area)
+            f"{rad2_to_arcmin2(area):.2f}" if math.isfinite(area) else ""
             for area in (cycle.a_sigma_now_rad2, cycle.a_sigma_uncertainty_rad2, cycle.a_sigma_predicted_rad2)
         )
         table.add_row(
             str(cycle.number),
             str(cycle.n_records),
-            f"{now:.2f} +- {doubt:.2f}",
-            f"{predicted:.2f}",
+            f"{now} +- {doubt}" if now and doubt else now or "-",
+            predicted or "-",
             cycle.decision.split(":")[0],
         )
     return table

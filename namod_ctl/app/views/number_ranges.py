@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
 from collections.abc import Iterable
 
 from namod_ctl.core.drives import Leg
+from namod_ctl.core.errors import ConfigError
+
+_RUN = re.compile(r"([0-9]{1,9})(?:\s*(?:-|to)\s*([0-9]{1,9}))?")
+_MOST_NUMBERS = 10_000
+"""More than any telescope has facets: a slip of the finger in a run must not fill the memory."""
 
 
 def runs_in_words(numbers: Iterable[int]) -> str:
@@ -17,6 +23,28 @@ def runs_in_words(numbers: Iterable[int]) -> str:
         else:
             runs.append([number])
     return ", ".join(f"{run[0]} to {run[-1]}" if len(run) > 2 else ", ".join(map(str, run)) for run in runs)
+
+
+def numbers_of_words(text: str) -> tuple[int, ...]:
+    """What `runs_in_words` wrote, or a person in a hurry: `0, 2 to 7, 10` or `0,2-7,10`; each once, as they come.
+
+    Raises
+    ------
+    ConfigError
+        Some part is no number and no run of ascending numbers, or there are too many; says which part.
+    """
+    numbers: dict[int, None] = {}
+    for word in (part.strip() for part in text.split(",")):
+        match = _RUN.fullmatch(word)
+        if match is None:
+            raise ConfigError(f"{word!r} is no number; give numbers with commas between, such as 13,31 or 2-7")
+        first, last = int(match[1]), int(match[2] or match[1])
+        if last < first:
+            raise ConfigError(f"{word!r} goes downwards; write {last}-{first}")
+        if last - first >= _MOST_NUMBERS:
+            raise ConfigError(f"{word!r} are {last - first + 1} numbers; at most {_MOST_NUMBERS} in one run are taken")
+        numbers.update(dict.fromkeys(range(first, last + 1)))
+    return tuple(numbers)
 
 
 def legs_in_words(legs: Iterable[Leg]) -> str:

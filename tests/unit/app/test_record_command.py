@@ -51,7 +51,7 @@ def twin_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["--out", "{new}", "--until-uncertainty", "0.3"], "0.3arcmin"),
         (["--out", "{new}", "--until-uncertainty", "-1arcmin"], "positive"),
         (["--out", "{new}", "--append", "{run}"], "--append"),
-        (["--out", "{run}"], "exists"),
+        (["--out", "{run}"], "--append"),
         (["--out", "{run}", "--replay", "{run}"], "stays as it is"),
         (["--replay", "{run}"], "--out"),
         (["--out", "{new}", "--replay", "{run}", "--config", "fact"], "--replay"),
