@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import floor, log10
 
 import numpy as np
 
@@ -14,17 +15,28 @@ from namod_ctl.reconstruction.halves import HalvesComparison
 from namod_ctl.reconstruction.reconstruct import Reconstruction
 
 REPORT_FILE = "report.txt"
+LIMIT_WORDS = "limit of mirrors without figure errors (ray-traced)"
+"""What the area of an ideal reflector is called wherever people read of it."""
 
 
-def _area(area: AreaOfPsf) -> str:
+def area_text(area: AreaOfPsf) -> str:
+    """An area in square minutes of arc with its uncertainty, if it has one, in two significant digits."""
     if not np.isfinite(area.a_sigma_rad2):
         return "not known: this estimator states no uncertainty"
     value, uncertainty = rad2_to_arcmin2(area.a_sigma_rad2), rad2_to_arcmin2(area.uncertainty_rad2)
-    return f"{value:.1f} +- {uncertainty:.1f} arcmin2" if uncertainty > 0.0 else f"{value:.1f} arcmin2"
+    if not uncertainty > 0.0:
+        return f"{value:.1f} arcmin2"
+    n_decimals = max(1 - floor(log10(uncertainty)), 0)
+    if round(uncertainty, n_decimals) >= 10.0 ** (2 - n_decimals):  # 0.0996 is 0.10, not 0.100
+        n_decimals = max(n_decimals - 1, 0)
+    return f"{value:.{n_decimals}f} +- {uncertainty:.{n_decimals}f} arcmin2"
 
 
 def report_text(result: Reconstruction, n_rejected: Mapping[RejectReason, int]) -> str:
-    """The report as plain text, lines ended by newlines; `n_rejected` counts the records that never counted."""
+    """The report as plain text, lines ended by newlines; `n_rejected` counts the records that never counted.
+
+    What its areas mean: docs/decisions/0003.
+    """
     alignment = result.alignment
     axis_deg = rad_to_deg(alignment.axis_rad)
     lines = [
@@ -39,10 +51,13 @@ def report_text(result: Reconstruction, n_rejected: Mapping[RejectReason, int]) 
     lines += [
         "",
         "Point spread function of the whole reflector, A_sigma",
-        f"  now                         {_area(alignment.now)}",
-        f"  predicted after correction  {_area(alignment.predicted)}",
-        f"  ray-traced limit            {_area(result.limit)} (these facets, own focal lengths, perfectly aligned)",
+        f"  now                         {area_text(alignment.now)}",
+        f"  predicted after correction  {area_text(alignment.predicted)}",
+        f"  limit                       {area_text(result.limit)}",
         f"  aim of the corrections      ({axis_deg[0]:+.4f}, {axis_deg[1]:+.4f}) deg",
+        f"  The {LIMIT_WORDS}: these facets, each of its own focal length,",
+        "  perfectly aligned. The prediction is with facets of ideal figure, too: it is of ray-traced light, and what",
+        "  the facets' own figure errors add is not in it. The preview of a campaign counts these errors.",
         "",
         f"Bad records: {len(alignment.bad_records)} of {alignment.n_records}, "
         + ("left out" if alignment.estimator == DEFAULT_ESTIMATOR else f"which estimator {alignment.estimator} uses"),

@@ -124,10 +124,10 @@ def state_of(campaign: Path) -> str | None:
 
 
 @contextmanager
-def served(path: Path) -> Iterator[str]:
+def served(path: Path, port: int = 0) -> Iterator[str]:
     """The page of the run or campaign, at an address of this computer."""
     server = build_server(path, Rules(TOKEN, is_loopback=True))
-    with listen("127.0.0.1", 0) as listening:
+    with listen("127.0.0.1", port) as listening:
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]})
         thread.start()
         try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import re
 import threading
@@ -13,10 +14,13 @@ import numpy as np
 import pytest
 from dashboard_samples import EVIL, new_run, record
 from page_rig import NOT_RED, OVERLAPS, SIZES, TOKEN, Watcher, served, state_of, wait_until
+from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
 from namod_ctl.core.flags import RejectReason
+from namod_ctl.core.units import m_to_mm
 from namod_ctl.cycle.recording_control import RecordingControl
+from namod_ctl.store.campaign import CampaignStore
 
 axe = pytest.importorskip("axe_core_python.sync_playwright")
 
@@ -148,6 +152,23 @@ def test_pictures_that_were_kept_are_shown_with_what_was_found_in_them(page: Pag
             expect(page.locator("#star-missing")).to_have_text("")
 
 
+def test_bright_pictures_are_red_by_night(page: Page, tmp_path: Path) -> None:
+    page.emulate_media(color_scheme="dark")
+    with new_run(tmp_path / "R") as run:
+        ramp = np.tile(np.linspace(0, 255, 160).astype(np.uint8), (120, 1))
+        run.add_frame(0, "reflector_camera", ramp)
+        run.append([record(0, len(run.facet_ids))])
+        with served(tmp_path / "R") as address:
+            opened(page, address)
+            expect(page.locator("#mirror-image")).to_be_visible()
+            page.locator("#mirror").evaluate("(map) => { map.style.visibility = 'hidden'; }")
+            shown = Image.open(io.BytesIO(page.locator("#mirror-picture").screenshot())).convert("RGB")
+    inside = np.asarray(shown).astype(float)[8:-8, 8:-8]  # the corners are round
+    red, green, blue = np.moveaxis(inside, 2, 0)
+    assert red.max() > 150.0  # it is to be seen
+    assert (np.maximum(green, blue) <= 0.6 * red + 3.0).all()
+
+
 def test_html_in_a_name_is_shown_as_it_is(page: Page, watcher: Watcher, tmp_path: Path) -> None:
     with new_run(tmp_path / "R", EVIL) as run, served(tmp_path / "R") as address:
         run.append([record(0, len(run.facet_ids))])
@@ -162,7 +183,10 @@ def test_plain_recording_is_ended_from_the_page_after_one_confirmation(page: Pag
     with new_run(tmp_path / "R") as run, served(tmp_path / "R") as address:
         run.append([record(0, len(run.facet_ids))])
         opened(page, f"{address}#token={TOKEN.replace(' ', '%20')}")
-        expect(page.locator("#stop")).to_have_attribute("aria-disabled", "true")  # nobody records
+        expect(page.locator("#stop")).to_have_attribute("aria-disabled", "true")  # nobody records, it seems
+        page.locator("#stop").click(force=True)  # what a page believes may be old: it can be asked all the same
+        page.get_by_role("button", name="Stop now").click()
+        expect(page.locator("#reply")).to_contain_text("nobody is at work")
         with RecordingControl(tmp_path / "R", is_asked.set) as control:
             expect(page.locator("#stop")).to_have_attribute("aria-disabled", "false")
             page.locator("#stop").click()
@@ -183,6 +207,70 @@ def looking(control: RecordingControl, is_asked: threading.Event) -> None:
         control.look()
 
 
+def planned_mm(page: Page) -> dict[tuple[int, int], float]:
+    """Travels that the page's table of the legs announces, by facet and number of the leg."""
+    rows = page.locator("#legs tr").evaluate_all("(rows) => rows.map((r) => [...r.cells].map((c) => c.textContent))")
+    return {(int(row[0]), int(row[1])): float(row[4].removesuffix(" mm")) for row in rows if row[4] != "–"}
+
+
+def travels_mm(campaign: Path) -> dict[tuple[int, int], float]:
+    """Travels that are ordered."""
+    with CampaignStore.open(campaign) as store:
+        orders = [journaled.order for journaled in store.orders()]
+    return {(o.leg.facet_id, o.leg.index + 1): float(m_to_mm(o.target_m - o.start_m)) for o in orders}
+
+
+def test_who_is_asked_sees_what_would_move_how_far_and_what_is_to_be_won(
+    page: Page, waiting_campaign: Path, address: str
+) -> None:
+    opened(page, address)
+    planned = planned_mm(page)
+    expect(page.locator("#preview-text")).to_contain_text(f"{len(planned)} legs of ")
+    (facet, leg), farthest_mm = max(planned.items(), key=lambda item: abs(item[1]))
+    expect(page.locator("#preview-text")).to_contain_text(f"leg {leg} of facet {facet} by {farthest_mm:+.3f} mm")
+    with CampaignStore.open(waiting_campaign) as store:
+        predicted_arcmin2 = math.degrees(math.degrees(store.cycles()[-1].a_sigma_predicted_rad2)) * 3600.0
+    expect(page.locator("#preview-text")).to_contain_text(f"{predicted_arcmin2:.2f} arcmin² predicted")
+    page.locator("#facet-choice").select_option(str(facet))
+    expect(page.locator("#facet-numbers")).to_contain_text(f"would go by {farthest_mm:+.3f} mm")
+
+
+def test_page_whose_program_ended_says_how_to_look_again_and_keeps_the_choice(page: Page, tmp_path: Path) -> None:
+    with new_run(tmp_path / "R") as run:
+        run.append([record(0, len(run.facet_ids))])
+        with served(tmp_path / "R") as first:
+            opened(page, first)
+            page.locator("#facet-choice").select_option(index=2)
+            chosen = page.locator("#mirror .facet").nth(2)
+            expect(chosen).to_have_attribute("aria-selected", "true")
+        expect(page.locator("#banner")).to_contain_text("namod-ctl dashboard R")
+        with served(tmp_path / "R", urlsplit(first).port or 0):
+            expect(page.locator("#banner")).to_be_hidden()
+            expect(chosen).to_have_attribute("aria-selected", "true")
+
+
+def test_picture_stays_when_the_next_one_is_gone(page: Page, tmp_path: Path) -> None:
+    with new_run(tmp_path / "R") as run:
+        frame = np.full((120, 160), 90, dtype=np.uint8)
+        run.add_frame(0, "star_camera", frame)
+        run.append([record(0, len(run.facet_ids))])
+        with served(tmp_path / "R") as address:
+            opened(page, address)
+            image = page.locator("#star-image")
+            expect(image).to_be_visible()
+            page.route("**/frame/**", lambda route: route.fulfill(status=204))
+            with page.expect_response("**/frame/**") as asked:
+                run.add_frame(1, "star_camera", frame)
+                run.append([record(1, len(run.facet_ids))])
+            assert asked.value.status == 204
+            expect(page.locator("#numbers")).to_contain_text("2 count")
+            assert image.evaluate("(image) => [image.naturalWidth, image.complete, image.src.at(-1)]") == [
+                160,
+                True,
+                "0",
+            ]
+
+
 def test_commands_need_the_token_stop_needs_one_confirmation_and_the_end_can_be_viewed(
     page: Page, waiting_campaign: Path, address: str
 ) -> None:
@@ -200,8 +288,16 @@ def test_commands_need_the_token_stop_needs_one_confirmation_and_the_end_can_be_
     page.goto("about:blank")
     opened(page, f"{address}#token={TOKEN.replace(' ', '%20')}")
     assert "token" not in page.url
+    page.get_by_role("button", name="Refuse: nothing moves, the campaign is held").click()
+    expect(page.locator("#stop-dialog")).to_contain_text("namod-ctl release")
+    page.get_by_role("button", name="Go back").click()
+    assert state_of(waiting_campaign) == "awaiting_approval"
+    promised_mm = planned_mm(page)
     approve.click()
     expect(page.locator("#journal")).to_contain_text("approved by a person")
+    wait_until(lambda: len(travels_mm(waiting_campaign)) == len(promised_mm), "not what was promised is ordered")
+    assert travels_mm(waiting_campaign) == pytest.approx(promised_mm, abs=0.00051)
+    expect(page.locator("#preview")).to_be_hidden()
 
     page.locator("#stop").click()
     page.get_by_role("button", name="Go back").click()

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from campaign_rig import SEED, SETTINGS, small_config
 
+from namod_ctl.app.build import bench_sky
 from namod_ctl.app.build.bench_sky import twin_equipment
-from namod_ctl.app.build.instrument import bench_sky
 from namod_ctl.app.build.recording import build_record_settings
 from namod_ctl.app.build.twin import build_twin
 from namod_ctl.core.clock import SystemClock

@@ -14,7 +14,7 @@ from typing import Literal
 
 import pytest
 
-from namod_ctl.app.build.instrument import cameras as build_cameras
+from namod_ctl.app.build import cameras as build_cameras
 from namod_ctl.app.build.sky_campaign import check_hardware, open_sky_campaign
 from namod_ctl.app.build.twin import build_twin
 from namod_ctl.app.config.instrument import InstrumentConfig, load_config

@@ -29,12 +29,13 @@ from namod_ctl.app.views.actuator_tables import (
 )
 from namod_ctl.app.views.number_ranges import counted, legs_in_words
 from namod_ctl.core.clock import SystemMonotonicClock
-from namod_ctl.core.drives import DriveState, Leg
+from namod_ctl.core.drives import Drive, DriveState, Leg
 from namod_ctl.core.errors import CommunicationError, ConfigError
 from namod_ctl.core.interfaces import MonotonicClock
 from namod_ctl.core.motion import MoveOrder, MoveOutcome, MoveResult, StopSwitch
 from namod_ctl.core.motion_settings import MotionSettings
 from namod_ctl.core.units import m_to_mm, mm_to_m
+from namod_ctl.cycle.leg_course import refusal
 from namod_ctl.cycle.mover import Mover
 from namod_ctl.cycle.selftest import self_test
 from namod_ctl.devices.buses import open_bus
@@ -55,6 +56,7 @@ app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode="markdown",
     help="Look at the drives of the legs, move, stop, test.",
+    epilog="Example: namod-ctl actuators list --twin",
 )
 
 _Config = Annotated[str, typer.Option("--config", help="Instrument: a TOML file, or a built-in name.")]
@@ -74,6 +76,7 @@ class _Rig:
     settings: MotionSettings
     console: Console
     bus_names: Mapping[Leg, str]
+    drives: Mapping[Leg, Drive]
 
     def chosen(self, names: list[str] | None, *, is_all: bool) -> tuple[Leg, ...]:
         if bool(names) == is_all:
@@ -238,10 +241,42 @@ def _carry_out(
             if isinstance(state, DriveState)
         ]
         rig.console.print(table_of_orders(orders))
-        _ask(f"{counted(len(orders), 'leg')} to move. Go on?", is_yes=is_yes)
-        results = _execute(rig, orders)
+        refused = _refused(rig, orders, states)
+        allowed = [order for order in orders if order.leg not in refused]
+        if refused:
+            rig.console.print(table_of_words("refused", refused))
+        if not allowed:
+            rig.console.print("nothing was moved")
+            _leave(is_complete=False)
+        _ask(f"{counted(len(allowed), 'leg')} to move. Go on?", is_yes=is_yes)
+        results = _execute(rig, allowed)
         rig.console.print(table_of_results(results))
-    _leave(is_complete=all(result.outcome is MoveOutcome.ARRIVED for result in results))
+    _leave(is_complete=not refused and all(result.outcome is MoveOutcome.ARRIVED for result in results))
+
+
+def _refused(rig: _Rig, orders: Sequence[MoveOrder], states: Mapping[Leg, DriveState | str]) -> dict[Leg, str]:
+    """Why legs will not move, before anybody is asked to agree: their own reasons, or a leg's of their facet."""
+    own: dict[Leg, str] = {}
+    for order in orders:
+        state, way_m, most_m = states[order.leg], order.target_m - order.start_m, rig.settings.max_travel_per_cycle_m
+        if isinstance(state, DriveState) and (words := refusal(order, state, rig.drives[order.leg], rig.settings)):
+            low_m, high_m = rig.mover.range_m(order.leg)
+            is_too_far = state.is_homed and not state.faults and not state.is_moving and abs(way_m) > most_m
+            own[order.leg] = (
+                f"{m_to_mm(abs(way_m)):.4f} mm is more than the {m_to_mm(most_m):.4f} mm that one move may be; its "
+                f"range is {m_to_mm(low_m):.4f} to {m_to_mm(high_m):.4f} mm"
+                if is_too_far
+                else words
+            )
+    first_of_facet: dict[int, Leg] = {}
+    for leg in own:
+        first_of_facet.setdefault(leg.facet_id, leg)
+    return {
+        order.leg: own.get(order.leg)
+        or f"its facet moves whole or not at all, and leg {first_of_facet[order.leg.facet_id].index + 1} is refused"
+        for order in orders
+        if order.leg.facet_id in first_of_facet
+    }
 
 
 def _stop_hardware(config: InstrumentConfig) -> tuple[dict[Leg, str], list[str]]:
@@ -297,7 +332,8 @@ def _rig(config: str, *, is_twin: bool) -> Iterator[_Rig]:
         stack.enter_context(_ended_by_sigterm())
         prefix = "twin/" if is_twin else ""
         bus_names = {drive.leg: f"{prefix}{bus.name}" for bus in build_bus_settings(loaded) for drive in bus.drives}
-        yield _Rig(Mover(buses, clock, settings, StopSwitch()), settings, console, bus_names)
+        drives_of_legs = {leg: drive for bus in buses for leg, drive in bus.drives.items()}
+        yield _Rig(Mover(buses, clock, settings, StopSwitch()), settings, console, bus_names, drives_of_legs)
 
 
 @contextmanager

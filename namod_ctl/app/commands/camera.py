@@ -42,7 +42,11 @@ EXIT_REFUSED, EXIT_UNKNOWN = 1, 3
 FOCUS_HOST, FOCUS_PORT = "127.0.0.1", 8766  # the live page may be there too
 
 app = typer.Typer(
-    add_completion=False, no_args_is_help=True, help="Try one camera: a frame, numbers, focus, exposures."
+    add_completion=False,
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    help="Try one camera: a frame, numbers, focus, exposures.",
+    epilog="Example: namod-ctl camera snap star --twin --out star.png",
 )
 
 _Camera = Annotated[

@@ -12,6 +12,7 @@ from rich.console import Console
 
 from namod_ctl.app.alignment_files import read_alignment
 from namod_ctl.app.build.instrument import build_instrument
+from namod_ctl.app.campaign_choice import check_run
 from namod_ctl.app.config.instrument import InstrumentConfig
 from namod_ctl.app.pictures.figure_style import figure_to_png
 from namod_ctl.app.pictures.fingerprints import FINGERPRINTS_FILE, Fingerprint, draw_fingerprints
@@ -78,6 +79,7 @@ def _names(run1: Path, run2: Path) -> tuple[str, str]:
 
 
 def _read(path: Path, name: str) -> _Run:
+    check_run(path)
     with RunStore.open(path) as store:
         instrument = build_instrument(InstrumentConfig.from_json(store.config_json, f"{path}: config"))
         table = tabulate_responses(store.records(), store.facet_ids)

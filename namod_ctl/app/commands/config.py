@@ -20,6 +20,7 @@ app = typer.Typer(
     add_completion=False,
     rich_markup_mode="markdown",
     help="Check the config of an instrument, list those that come with the program.",
+    epilog="Example: namod-ctl config check fact",
 )
 
 

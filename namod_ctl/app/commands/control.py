@@ -95,7 +95,9 @@ def release(campaign: _Campaign = None) -> None:
     with CampaignStore.open(path, read_only=False) as store:
         state = store.last_state()
         if state != "held":
-            _refuse(f"there is nothing to release: {path} is not held, its state is {state or 'idle'}")
+            _refuse(
+                f"there is nothing to release: {path} is not held, its state is {(state or 'idle').replace('_', ' ')}"
+            )
 
         def journal(source: str, trigger: str, destination: str, reason: str) -> None:
             store.add_transition(source, destination, trigger, reason)
@@ -156,7 +158,7 @@ def _ask(path: Path, request: Request) -> None:
             sent.withdraw()
         raise
     if answer is None:
-        typer.echo(f"Taken: {request.kind}.")
+        typer.echo(f"Taken: {request.kind.replace('_', ' ')}.")
     elif answer.is_accepted:
         typer.echo(answer.text)
     else:

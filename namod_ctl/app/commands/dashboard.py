@@ -11,11 +11,11 @@ from typing import Annotated
 
 import typer
 
+from namod_ctl.app.dashboard.addresses import own_addresses
 from namod_ctl.app.dashboard.beside import NICENESS
-from namod_ctl.app.dashboard.guard import MIN_TOKEN_LENGTH, Rules, is_loopback
+from namod_ctl.app.dashboard.guard import TOKEN_VARIABLE, Rules, checked_token, is_loopback
 from namod_ctl.app.dashboard.server import build_server, listen
 from namod_ctl.app.dashboard.state import Watched
-from namod_ctl.core.errors import ConfigError
 
 DEFAULT_PORT = 8765
 
@@ -29,7 +29,7 @@ def dashboard(
     token: Annotated[
         str | None,
         typer.Option(
-            envvar="NAMOD_CTL_TOKEN", help="What a page must know to send commands.  [default: a new one, printed]"
+            envvar=TOKEN_VARIABLE, help="What a page must know to send commands.  [default: a new one, printed]"
         ),
     ] = None,
 ) -> None:
@@ -40,29 +40,27 @@ def dashboard(
 
     Example: namod-ctl dashboard CAMPAIGN
     """
-    rules = Rules(_checked(token) if token is not None else secrets.token_urlsafe(16), is_loopback(host))
+    rules = Rules(
+        checked_token(token, "--token") if token is not None else secrets.token_urlsafe(16), is_loopback(host)
+    )
     with Watched(path):  # what is wrong with it is said here
         pass
     with suppress(OSError):
         os.nice(NICENESS)
     with listen(host, port) as listening:
-        shown = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
-        address = f"http://{shown}:{listening.getsockname()[1]}/"
+        port = listening.getsockname()[1]
+        # a phone seldom knows this computer's name
+        shown = [*own_addresses(), socket.gethostname()] if host in ("0.0.0.0", "::") else [host]
+        addresses = [f"http://{f'[{one}]' if ':' in one else one}:{port}/" for one in shown]
         if not rules.is_loopback:
             typer.echo(
                 f"WARNING: --host {host} shows this page to everybody in the network, unencrypted; with the token they "
                 "can also stop and move the telescope. For a phone on the dish use a network of your own.",
                 err=True,
             )
-        typer.echo(f"Look:     {address}")
-        typer.echo(f"Command:  {address}#token={rules.token}")
+        for address in addresses:
+            typer.echo(f"Look:     {address}")
+        for address in addresses:
+            typer.echo(f"Command:  {address}#token={rules.token}")
         with suppress(KeyboardInterrupt):
             build_server(path, rules).run(sockets=[listening])
-
-
-def _checked(token: str) -> str:
-    if len(token) < MIN_TOKEN_LENGTH or not token.isascii() or not token.isprintable() or " " in token:
-        raise ConfigError(
-            f"--token: must be at least {MIN_TOKEN_LENGTH} plain characters without blanks; leave it out for a new one"
-        )
-    return token

@@ -11,7 +11,14 @@ from rich.text import Text
 
 from namod_ctl.app.config.instrument import load_config
 from namod_ctl.app.views.camera_listing import list_all_cameras
-from namod_ctl.app.views.device_tables import Inventory, answering_servers, as_json, tables, wanted_devices
+from namod_ctl.app.views.device_tables import (
+    Inventory,
+    answering_servers,
+    as_json,
+    emulated_cameras,
+    tables,
+    wanted_devices,
+)
 from namod_ctl.devices.ports import list_serial_ports
 from namod_ctl.devices.usb_tree import read_usb_tree
 
@@ -29,9 +36,11 @@ def devices(
 
     Example: namod-ctl devices --config config/fact.toml
     """
-    wanted = [] if config is None else wanted_devices(load_config(config))
+    loaded = None if config is None else load_config(config)
+    wanted = [] if loaded is None else wanted_devices(loaded)
+    emulated = [] if loaded is None else emulated_cameras(loaded)
     found = (list_all_cameras(), list_serial_ports(), read_usb_tree())
-    inventory = Inventory(*found, wanted, answering_servers(wanted))
+    inventory = Inventory(*found, wanted, answering_servers(wanted), emulated)
     if as_json_:
         typer.echo(json.dumps(as_json(inventory), indent=1))
     else:
@@ -51,6 +60,8 @@ def _print(inventory: Inventory) -> None:
             console.print(Text(f"{listing.driver}: no camera"))
     if not inventory.ports:
         console.print(Text("no serial ports"))
+    for emulated in inventory.emulated:
+        console.print(Text(emulated))
     for unlisted in inventory.unlisted:
         console.print(Text(unlisted))
     for warning in inventory.usb.warnings:

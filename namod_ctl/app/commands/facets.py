@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import chain, count
 from pathlib import Path
 from typing import Annotated
 
@@ -14,11 +15,13 @@ from namod_ctl.app.facet_editor.workbench import Workbench, open_workbench
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.optics.polygons import map_faults
 from namod_ctl.store.facet_tables import read_polygon_table
+from namod_ctl.store.results import write_results
 
 app = typer.Typer(
     add_completion=False,
     rich_markup_mode="markdown",
     help="Make and check the map of the facets in the reflector camera's image.",
+    epilog="Example: namod-ctl facets check --config fact",
     no_args_is_help=True,
 )
 
@@ -65,6 +68,8 @@ def propose(
 ) -> None:
     """Make the map without a browser, from marks in a file, from visible edges, or both.
 
+    A map that is replaced, the config's own as well, is kept beside the new one, with .bak after its name.
+
     Example: namod-ctl facets propose --image reflector.png --marks marks.csv --out my_polygons.csv
     """
     bench = _workbench(config, image, out)
@@ -98,8 +103,21 @@ def propose(
     for note in notes + bench.notes(pose):
         typer.echo(f"Note: {note}.")
     outlines = bench.outlines_px(pose)
+    kept = _keep_old(bench.out)
     written = bench.save(outlines, is_missing_confirmed=True, how="; ".join(how))
+    if kept is not None:
+        typer.echo(f"The map that was there is kept as {kept}.")
     typer.echo(f"{len(outlines)} outlines written to {written}. {bench.next_step()}")
+
+
+def _keep_old(path: Path | None) -> Path | None:
+    """A copy of the file beside it, under a name that was free; None where there is no such file."""
+    if path is None or not path.is_file():
+        return None
+    names = (f"{path.name}.bak{number}" for number in chain([""], count(2)))
+    kept = next(path.with_name(name) for name in names if not path.with_name(name).exists())
+    write_results(path.parent, {kept.name: path.read_bytes()})
+    return kept
 
 
 @app.command("check")

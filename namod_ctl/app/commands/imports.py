@@ -32,7 +32,11 @@ EXIT_INTERRUPTED = 130  # what shells report for a program that was ended by Ctr
 SAME_ANGLE_DECIMALS = 12  # of a degree: takes the rounding of deg -> rad -> deg away
 
 app = typer.Typer(
-    add_completion=False, help="Make a run of records that another program recorded.", no_args_is_help=True
+    add_completion=False,
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    help="Make a run of records that another program recorded.",
+    epilog="Example: namod-ctl import maps response_maps --out RUN --config fact",
 )
 
 OutOption = Annotated[Path, typer.Option("--out", help="Folder of the new run; must not exist yet.")]

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from namod_ctl.app.alignment_files import read_alignment
 from namod_ctl.app.build.instrument import build_instrument
+from namod_ctl.app.campaign_choice import check_run
 from namod_ctl.app.config.instrument import InstrumentConfig
 from namod_ctl.app.pictures.figure_style import figure_to_png
 from namod_ctl.app.sheets.instructions import (
@@ -25,6 +26,7 @@ from namod_ctl.app.sheets.instructions import (
 )
 from namod_ctl.app.sheets.ladder_sheets import PDF_FILE, sheets_to_pdf
 from namod_ctl.app.sheets.overlay import PNG_FILE, draw_instructions
+from namod_ctl.app.views.number_ranges import counted
 from namod_ctl.core.errors import ConfigError, StoreError
 from namod_ctl.core.flags import FacetFlag
 from namod_ctl.optics.instrument import Instrument
@@ -53,6 +55,7 @@ def instruct(
 
     Example: namod-ctl instruct runs/2014-05 --image reflector.png
     """
+    check_run(run)
     with RunStore.open(run) as store:
         instrument = build_instrument(InstrumentConfig.from_json(store.config_json, f"{run}: config"))
         alignment = read_alignment(run)
@@ -135,14 +138,14 @@ def _refuse_foreign_alignment(
 
 
 def _counts(instructions: tuple[FacetInstruction, ...]) -> str:
-    counted = Counter(instruction.verdict for instruction in instructions)
+    numbers = Counter(instruction.verdict for instruction in instructions)
     words = {
         Verdict.TURN: "to turn",
         Verdict.NO_TURN_NEEDED: "need no turn",
         Verdict.DO_NOT_TURN: "not to be turned",
         Verdict.NO_BOLTS: "without bolts",
     }
-    return ", ".join(f"{counted[verdict]} {text}" for verdict, text in words.items() if counted[verdict])
+    return ", ".join(f"{numbers[verdict]} {text}" for verdict, text in words.items() if numbers[verdict])
 
 
 def _forbidden(instructions: tuple[FacetInstruction, ...]) -> dict[str, list[int]]:
@@ -158,7 +161,7 @@ def _forbidden(instructions: tuple[FacetInstruction, ...]) -> dict[str, list[int
 
 def _headline(alignment: Alignment, run: str, instructions: tuple[FacetInstruction, ...]) -> str:
     headline = (
-        f"{alignment.telescope}, run {run}: {len(instructions)} facets, {_counts(instructions)} "
+        f"{alignment.telescope}, run {run}: {counted(len(instructions), 'facet')}, {_counts(instructions)} "
         f"(estimator {alignment.estimator}, {alignment.n_used} of {alignment.n_records} records)"
     )
     doubtful = _resting_on_bad_records(alignment)
@@ -172,7 +175,7 @@ def _resting_on_bad_records(alignment: Alignment) -> str:
 
 
 def _report(alignment: Alignment, instructions: tuple[FacetInstruction, ...], folder: Path) -> None:
-    typer.echo(f"{len(instructions)} facets: {_counts(instructions)}.")
+    typer.echo(f"{counted(len(instructions), 'facet')}: {_counts(instructions)}.")
     if instructions and all(instruction.verdict is Verdict.NO_BOLTS for instruction in instructions):
         typer.echo("This telescope has no bolts: its legs are driven; their travels are in alignment.json.")
     for reasons, facet_ids in _forbidden(instructions).items():

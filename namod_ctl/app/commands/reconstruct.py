@@ -12,6 +12,7 @@ from rich.console import Console
 
 from namod_ctl.app.alignment_files import ALIGNMENT_FILE, alignment_files, alignment_to_json
 from namod_ctl.app.build.instrument import build_instrument
+from namod_ctl.app.campaign_choice import check_run
 from namod_ctl.app.combined_run import combined_run
 from namod_ctl.app.config.instrument import InstrumentConfig
 from namod_ctl.app.pictures.figure_style import figure_to_png
@@ -35,6 +36,7 @@ from namod_ctl.store.combine import NOTE_COMBINED
 from namod_ctl.store.results import write_results
 from namod_ctl.store.run import RunStore
 
+_INSTRUCTIONS = CSV_FILE, PNG_FILE, PDF_FILE
 _MIN_BIN_DEG, _MAX_BIN_DEG = 0.0005, 1.0
 
 
@@ -78,6 +80,8 @@ def reconstruct_run(
         raise ConfigError(f"{len(runs)} runs are named: say with --out where the run goes that combines them")
     if len(runs) == 1 and (out is not None or force):
         raise ConfigError("--out and --force are for several runs: the results of one run go into its own folder")
+    for named in runs:
+        check_run(named)
     console = Console(highlight=False)
     clock = SystemClock()
     with ExitStack() as stack:
@@ -86,12 +90,21 @@ def reconstruct_run(
             run = out
             with console.status(f"combining {len(runs)} runs"):
                 folder = stack.enter_context(combined_run(runs, out, clock, force=force))
+        had_instructions = any((run / name).exists() for name in _INSTRUCTIONS)
         report = _reconstruct_in(folder, estimator, deg_to_rad(bin_size_deg), clock, console, halves=halves)
     console.print(report, soft_wrap=True, markup=False)
     console.print(
         f"Written to {run}: {ALIGNMENT_FILE}, {REPORT_FILE}, tables and pictures. Next: namod-ctl instruct {run}",
         soft_wrap=True,
+        markup=False,
     )
+    if had_instructions:
+        console.print(
+            "The instructions.* that lay there were of an older reconstruction and are removed: make new ones before "
+            f"anybody turns a bolt, and keep no old sheet: namod-ctl instruct {run}",
+            soft_wrap=True,
+            markup=False,
+        )
 
 
 def _reconstruct_in(
@@ -137,5 +150,5 @@ def _write(run: Path, result: Reconstruction, instrument: Instrument, bin_size_r
     }
     files = {name: figure_to_png(figure) for name, figure in pictures.items()}
     write_results(run, files | {REPORT_FILE: report.encode()} | alignment_files(result.alignment))
-    for name in (CSV_FILE, PNG_FILE, PDF_FILE):
+    for name in _INSTRUCTIONS:
         (run / name).unlink(missing_ok=True)  # instructions of another estimate must not be taken for this one's

@@ -24,6 +24,7 @@ from namod_ctl.app.build.twin import build_twin, load_twin_settings, with_facet_
 from namod_ctl.app.build.twin_note import different_sections, note_twin, noted_twin
 from namod_ctl.app.config.instrument import InstrumentConfig, load_config
 from namod_ctl.app.dashboard.beside import dashboard_beside
+from namod_ctl.app.views.number_ranges import counted
 from namod_ctl.app.views.recording_view import TerminalView
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.errors import ConfigError
@@ -338,7 +339,7 @@ def _print_summary(path: Path, reason: str, progress: Progress, events: list[str
     for rejection, n in progress.rejected.items():
         console.print(f"  {n} {rejection.name}: {REJECT_REASON_MEANING[rejection]}", markup=False)
     for cause, n in progress.source.dropped.items():
-        console.print(f"  {n} pairs retaken: {cause.value}", markup=False)
+        console.print(f"  {counted(n, 'pair')} retaken: {cause.value}", markup=False)
     if progress.source.n_frames_missed:
         console.print(f"  {progress.source.n_frames_missed} frames were counted by a camera but never came")
     for event in events:

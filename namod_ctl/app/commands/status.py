@@ -1,4 +1,4 @@
-"""`namod-ctl status`: how a campaign stands, whether or not somebody works on it."""
+"""`namod-ctl status`: how a campaign or a recording stands, whether or not somebody works on it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ import typer
 from rich.console import Console
 
 from namod_ctl.app.campaign_choice import CAMPAIGN_HELP, choose_campaign
+from namod_ctl.app.reconstruction_report import LIMIT_WORDS
 from namod_ctl.app.views.number_ranges import counted, legs_in_words, runs_in_words
+from namod_ctl.app.views.run_status import describe_run, run_lines
 from namod_ctl.core.drives import Leg
 from namod_ctl.core.motion import MoveOutcome
 from namod_ctl.core.units import rad2_to_arcmin2
@@ -20,6 +22,8 @@ from namod_ctl.cycle.machine import FINAL, STATES
 from namod_ctl.store.campaign import CampaignStore
 from namod_ctl.store.campaign_lock import running_pid
 from namod_ctl.store.campaign_rows import TRANSITION
+from namod_ctl.store.folders import is_run
+from namod_ctl.store.run import RunStore
 
 SCHEMA = "namod-status/1"
 N_EVENTS = 10
@@ -29,14 +33,25 @@ _Said = TypeVar("_Said")
 
 def status(
     campaign: Annotated[
-        Path | None, typer.Argument(metavar="[CAMPAIGN]", help=CAMPAIGN_HELP, show_default=False)
+        Path | None,
+        typer.Argument(metavar="[CAMPAIGN|RUN]", help=f"Folder of a run, or: {CAMPAIGN_HELP}", show_default=False),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print it for a program.")] = False,
 ) -> None:
     """Show how a campaign stands: its state, its cycles, what is refused, and what happened last.
 
+    Of a run: how many records it has, how fast they come, what is wrong, and what is waited for.
+
     Example: namod-ctl status CAMPAIGN --json
     """
+    if campaign is not None and is_run(campaign):
+        with RunStore.open(campaign) as run:
+            of_run = describe_run(run)
+        if as_json:
+            typer.echo(json.dumps(of_run, indent=2, allow_nan=False))
+        else:
+            typer.echo("\n".join(run_lines(of_run)))
+        return
     path = choose_campaign(campaign)
     pid = running_pid(path)
     with CampaignStore.open(path) as store:
@@ -95,7 +110,8 @@ def _next(store: CampaignStore, state: str, *, is_running: bool) -> str:
     if state == "awaiting_operator":
         waiting = sum(not turns.is_done for turns in store.turns())
         if waiting:
-            return f"bolts of {waiting} facets are turned; then 'namod-ctl done {store.path} --all' (or --facet IDS)"
+            facets = counted(waiting, "facet")
+            return f"bolts of {facets} are turned; then 'namod-ctl done {store.path} --all' (or --facet IDS)"
     if not is_running:
         if state in FINAL:
             return "nothing: it has ended"
@@ -142,7 +158,7 @@ def _print(standing: Mapping[str, Any]) -> None:
     console = Console(highlight=False, markup=False, soft_wrap=True)
     meaning = f" ({standing['state_meaning']})" if standing["state_meaning"] else ""
     console.print(f"{standing['campaign']}: {standing['source']}")
-    console.print(f"State:   {standing['state']}{meaning}")
+    console.print(f"State:   {standing['state'].replace('_', ' ')}{meaning}")
     if standing["reason"]:
         console.print(f"Because: {standing['reason']}")
     process = f"process {standing['process']}" if standing["process"] else "yes"
@@ -150,6 +166,7 @@ def _print(standing: Mapping[str, Any]) -> None:
     console.print(f"Next:    {standing['next']}")
     if standing["cycles"]:
         console.print("A_sigma, the area of the point spread function, in square minutes of arc:")
+        console.print(f"({LIMIT_WORDS} in the last column)")
         _print_cycles(console, standing["cycles"])
     for why, facet_ids in _by_words((int(facet_id), why) for facet_id, why in standing["refused_facets"].items()):
         noun = "facet" if len(facet_ids) == 1 else "facets"
@@ -183,7 +200,7 @@ def _by_words(said: Iterable[tuple[_Said, str]]) -> list[tuple[str, list[_Said]]
 
 def _print_cycles(console: Console, cycles: list[dict[str, Any]]) -> None:
     """Two lines per cycle: numbers below each other, and the whole decision, which is too long for a column."""
-    console.print(f"{'cycle':>7}  {'records':>7}  {'measured':>16}  {'predicted':>9}  {'ideal mirrors':>13}")
+    console.print(f"{'cycle':>7}  {'records':>7}  {'measured':>16}  {'predicted':>9}  {'limit':>13}")
     for cycle in cycles:
         area = cycle["a_sigma_arcmin2"]
         spread = f" +- {area['now_uncertainty']:.2f}" if area["now_uncertainty"] is not None else ""

@@ -61,6 +61,13 @@ def warnings_of(config: InstrumentConfig, instrument: Instrument) -> list[str]:
             f"the reflector is {seen_deg:.1f} deg wide as seen from the focal point, the reflector camera sees "
             f"{view_deg[0]:.1f} x {view_deg[1]:.1f} deg"
         )
+    devices = {"star_camera": config.star_camera.device, "reflector_camera": config.reflector_camera.device}
+    without = [name for name, device in devices.items() if device is None]
+    if len(without) == 1:
+        warnings.append(
+            f"{without[0]} has no device, the other camera has one: nothing can be recorded on a sky before "
+            f"[{without[0]}.device] says which camera it is"
+        )
     return warnings + actuator_warnings(config)
 
 
@@ -126,6 +133,7 @@ def _camera_rows(
     serial = f", serial number {section.serial_number}" if section.serial_number is not None else ""
     rows = [
         ("model", f"{section.model}{serial}"),
+        ("device", _device_in_words(section)),
         ("image", f"{section.columns} x {section.rows} px, full scale {section.full_scale_adu:g} adu"),
         ("saturated from", f"{section.saturation_share:.0%} of full scale"),
         ("plate scale", f"{section.plate_scale_mdeg_per_px:g} mdeg per px"),
@@ -139,6 +147,18 @@ def _camera_rows(
         rows.append(("optical axis", f"at column {x_px:g}, row {y_px:g} ({known})"))
         rows.append(("star", f"{section.star_diameter_deg:g} deg across"))
     return tuple(rows)
+
+
+def _device_in_words(section: StarCameraSection | ReflectorCameraSection) -> str:
+    """By what the camera is found, for a person who looks for it."""
+    device = section.device
+    if device is None:
+        return "none: the digital twin"
+    if device.fed_by_twin:
+        return f"{device.driver}, emulated: shown the twin's sky"
+    number = f"serial number {section.serial_number}" if section.serial_number is not None else None
+    named = [part for part in (number, device.address, device.device) if part is not None]
+    return ", ".join([device.driver, *(named or ["the only camera that this driver sees"])])
 
 
 def _map_rows(instrument: Instrument) -> tuple[tuple[str, str], ...]:

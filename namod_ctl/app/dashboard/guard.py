@@ -17,7 +17,11 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from namod_ctl.core.errors import ConfigError
+
 TOKEN_HEADER: Final = "x-namod-token"
+TOKEN_VARIABLE: Final = "NAMOD_CTL_TOKEN"
+"""Of the environment: the token of every page that is begun without another one."""
 MAX_BODY_BYTES: Final = 4096
 MIN_TOKEN_LENGTH: Final = 12
 MAX_PATH_LENGTH: Final = 200
@@ -52,6 +56,15 @@ class Rules:
     token: str
     is_loopback: bool
     max_body_bytes: int = MAX_BODY_BYTES
+
+
+def checked_token(token: str, where: str) -> str:
+    """The token. Raises ConfigError, which names `where` it was given, for one that can be guessed or not be typed."""
+    if len(token) < MIN_TOKEN_LENGTH or not token.isascii() or not token.isprintable() or " " in token:
+        raise ConfigError(
+            f"{where}: must be at least {MIN_TOKEN_LENGTH} plain characters without blanks; leave it out for a new one"
+        )
+    return token
 
 
 def is_loopback(host: str) -> bool:

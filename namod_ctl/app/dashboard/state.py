@@ -18,14 +18,16 @@ from typing import Any, Final, Self
 from namod_ctl import __version__
 from namod_ctl.app.alignment_files import alignment_from_json
 from namod_ctl.app.config.instrument import InstrumentConfig
-from namod_ctl.app.dashboard import campaign_sections, facet_sections
+from namod_ctl.app.dashboard import campaign_sections, facet_sections, preview
 from namod_ctl.app.dashboard.run_sections import RunGlance, estimate_of
 from namod_ctl.core.errors import ConfigError, NamodError, StoreError
+from namod_ctl.core.units import um_to_m
 from namod_ctl.cycle.recording_control import pid_at_work
 from namod_ctl.optics.instrument import Instrument
 from namod_ctl.reconstruction.alignment import Alignment
 from namod_ctl.store.campaign import CampaignStore
 from namod_ctl.store.campaign_database import CAMPAIGN_DATABASE_NAME, connect_campaign, is_campaign
+from namod_ctl.store.campaign_rows import Cycle
 from namod_ctl.store.database import DATABASE_NAME, store_errors
 from namod_ctl.store.folders import is_run
 from namod_ctl.store.pulse import Pulse
@@ -75,6 +77,7 @@ class Watched:
         self._awaited_run: int | None = None  # a cycle is begun before its run is there, and nothing tells of that
         self._sent: Sections = {}
         self._alignments: dict[int, tuple[int, Alignment]] = {}
+        self._preview: tuple[int, dict[str, Any] | None] = (0, None)  # of which step of the journal
         self._pulse: Pulse | None = None
         if self.is_campaign:
             self._pulse = Pulse(connect_campaign(self._database, read_only=True), self._database)
@@ -211,6 +214,7 @@ class Watched:
         found["standing"] = campaign_sections.standing(store, self._pid)
         found["cycles"] = campaign_sections.cycle_table(cycles)
         found["actuators"] = campaign_sections.actuators(store)
+        found["preview"] = self._preview_of(store, cycles, alignments)
         found["journal"] = campaign_sections.journal(store.events())
         found["sheets"] = campaign_sections.sheets(store, cycles)
         self._has_estimate = bool(alignments)
@@ -225,6 +229,24 @@ class Watched:
         self._awaited_run = next((cycle.number for cycle in cycles[-1:] if cycle.number not in runs), None)
         if runs and (self._glance is None or self._glance.key != runs[-1]):
             self._follow(store.run_path(runs[-1]), runs[-1])
+
+    def _preview_of(
+        self, store: CampaignStore, cycles: list[Cycle], alignments: Mapping[int, Alignment]
+    ) -> dict[str, Any] | None:
+        """What waits for approval, None while nothing does; worked out once per question."""
+        step = store.last_transition()
+        if step is None or step.data.get("to") != preview.ASKING or not cycles or cycles[-1].number not in alignments:
+            return None
+        if self._preview[0] != step.id:
+            refused = preview.refused_in(store.events())
+            actuators = self._config.actuators
+            resolution_m = um_to_m(actuators.step_um) if actuators and actuators.step_um else 0.0
+            travels_m = preview.planned_travels(
+                self.instrument.mounts, alignments, store.orders(), refused, resolution_m
+            )
+            question = str(step.data.get("reason", ""))
+            self._preview = (step.id, preview.preview(cycles[-1], question, refused, travels_m))
+        return self._preview[1]
 
     def _look_at_run(self, found: dict[str, Any]) -> None:
         if self._campaign is None and self._glance is None:

@@ -340,7 +340,8 @@ document.addEventListener("keydown", (event) => {
 
 function setMode(mode) {
   document.documentElement.dataset.mode = mode;
-  localStorage.setItem("namod-mode", mode);
+  // as the live page does: a cookie, for cookies know no port, and the night is one for all pages
+  document.cookie = `namod-mode=${mode}; max-age=31536000; path=/; samesite=strict`;
   $("mode").setAttribute("aria-pressed", String(mode === "night"));
   redraw();
 }
@@ -361,7 +362,7 @@ document.querySelectorAll("input[name=tool]").forEach((radio) => radio.addEventL
 new ResizeObserver(() => { if (board.image) { if (board.isWhole) board.whole(); redraw(); } }).observe($("frame"));
 
 takeToken();
-if (localStorage.getItem("namod-mode") === "day") document.documentElement.dataset.mode = "day";
+$("mode").setAttribute("aria-pressed", String(document.documentElement.dataset.mode === "night"));
 try {
   const map = await fetchMap();
   knownIds = new Set(map.ids);
@@ -371,7 +372,6 @@ try {
   image.src = "/picture.png";
   await image.decode();
   board.show(image);
-  setMode(document.documentElement.dataset.mode);
   say("Type a facet's number, then click its centre.");
   changed();
 } catch (error) {

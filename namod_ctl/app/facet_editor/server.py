@@ -46,12 +46,16 @@ PAGE_FILES = {
     "server.js": "text/javascript; charset=utf-8",
     "icon.svg": "image/svg+xml",
 }
+THEME = "theme.js"
+"""Of the live page: night or day are remembered for all pages together."""
 
 
 def build_app(bench: Workbench, token: str) -> Starlette:
     """The editor as an ASGI application that takes what it is sent from its own page only, with `token`."""
     folder = files("namod_ctl.app.facet_editor")
+    types = {**PAGE_FILES, THEME: PAGE_FILES["editor.js"]}
     served = {name: (folder / name).read_bytes() for name in PAGE_FILES}
+    served[THEME] = (files("namod_ctl.app.dashboard") / "page" / THEME).read_bytes()
     picture = png_of(bench.image)
     made = {"hand": "drawn by hand"}  # how the outlines came about, by what the page says it shows
 
@@ -59,7 +63,7 @@ def build_app(bench: Workbench, token: str) -> Starlette:
         name = request.path_params.get("name", "editor.html")
         if name not in served:
             return PlainTextResponse("there is nothing here", 404)
-        return Response(served[name], media_type=PAGE_FILES[name])
+        return Response(served[name], media_type=types[name])
 
     async def image(_: Request) -> Response:
         return Response(picture, media_type="image/png")

@@ -182,7 +182,7 @@ def _facets(alignments: Sequence[Alignment], numbers: Sequence[int]) -> Chapter:
     """Every facet's direction in the first and the last cycle."""
     head = ["facet"]
     for number in numbers:
-        head += [f"{name} in {_name(number)}" for name in ("θx", "θy", "±", "off the aim")]
+        head += [f"{name} in {_name(number)}" for name in ("θx", "θy", "±", "light off the aim")]
     head.append("flags in the last")
     by_id = [{facet.facet_id: facet for facet in alignment.facets} for alignment in alignments]
     rows = []
@@ -198,7 +198,12 @@ def _facets(alignments: Sequence[Alignment], numbers: Sequence[int]) -> Chapter:
             cells += [number_text(x, "+.2f"), number_text(y, "+.2f"), number_text(doubt_arcmin(facet), ".2f")]
             cells.append(number_text(off, ".2f"))
         rows.append((*cells, ", ".join(by_id[-1][facet_id].flags.names)))
-    blocks: list[Block] = [Text("All in arcmin. Theta: where the star stands when the facet is brightest.")]
+    blocks: list[Block] = [
+        Text(
+            "All in arcmin. Theta: where the star stands when the facet is brightest. Its light falls so far off the "
+            "aim: twice what its normal is off by."
+        )
+    ]
     blocks += [Table(tuple(head), tuple(rows), frozenset({len(head) - 1}))]
     return Chapter("Facets", (*blocks, *flag_blocks(alignments[-1].facets)))
 

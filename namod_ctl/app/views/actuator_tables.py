@@ -99,7 +99,7 @@ def table_of_results(results: Sequence[MoveResult]) -> Table:
             short_name(result.order.leg),
             _mm(result.order.target_m),
             _mm(result.readback_m),
-            Text(result.outcome.value, style=style),
+            Text(result.outcome.value.replace("_", " "), style=style),
             Text(result.detail),
         )
     return table

@@ -69,17 +69,15 @@ class AlignView(View):
         travels_mm = [abs(m_to_mm(order.target_m - order.start_m)) for order in plan.orders]
         if travels_mm:
             self._line(
-                f"{counted(len(plan.orders), 'leg')} of {counted(len(plan.turned), 'facet')}, up to {max(travels_mm):.3f} mm; predicted "
-                f"{rad2_to_arcmin2(plan.forecast.a_sigma_rad2):.2f} arcmin2"
+                f"{counted(len(plan.orders), 'leg')} of {counted(len(plan.turned), 'facet')}, up to "
+                f"{max(travels_mm):.3f} mm; predicted {rad2_to_arcmin2(plan.forecast.a_sigma_rad2):.2f} arcmin2"
             )
         else:
             self._line(f"{counted(len(plan.turned), 'facet')} to turn by hand")
         for facet_id, why in list(plan.refused.items())[:MAX_REFUSED_SHOWN]:
             self._line(f"facet {facet_id} stays as it is: {why}")
         if len(plan.refused) > MAX_REFUSED_SHOWN:
-            self._line(
-                f"not turned either: {len(plan.refused) - MAX_REFUSED_SHOWN} more; namod-ctl status lists them"
-            )
+            self._line(f"so do {len(plan.refused) - MAX_REFUSED_SHOWN} more; namod-ctl status lists them")
 
     def told(self, text: str) -> None:
         """A sentence of the campaign."""
@@ -91,7 +89,7 @@ class AlignView(View):
         return None if text is None else text.lower() in ("y", "yes")
 
     def turned(self) -> Sequence[int] | Literal["all"]:
-        """What the person at this terminal types: ids of facets with commas between, 2-7 for a run, or all, and Enter."""
+        """What the person at this terminal types: ids of facets such as 13,31,2-7, or all, and Enter."""
         text = self._typed("which facets are turned? [13,31,2-7 or all] (or `namod-ctl done` elsewhere) ")
         if not text:
             return ()

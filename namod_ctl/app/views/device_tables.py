@@ -78,13 +78,17 @@ class WantedDevice:
 
 @dataclass(frozen=True, slots=True)
 class Inventory:
-    """All that was found, and what the config wants of it; `answering` are servers that the config names."""
+    """All that was found, and what the config wants of it.
+
+    `answering` are servers that the config names, `emulated` its cameras that nobody plugs in (`emulated_cameras`).
+    """
 
     listings: Sequence[DriverListing]
     ports: Sequence[FoundPort]
     usb: UsbTree
     wanted: Sequence[WantedDevice] = ()
     answering: Collection[tuple[str, int]] = ()
+    emulated: Sequence[str] = ()
 
     def entries_of_camera(self, camera: FoundCamera) -> list[str]:
         """The config's entries that mean this camera."""
@@ -163,6 +167,16 @@ def wanted_devices(config: InstrumentConfig) -> list[WantedDevice]:
     return wanted + [WantedDevice(f"actuators.{b.name}", "serial", "", b.url) for b in buses if "://" not in b.url]
 
 
+def emulated_cameras(config: InstrumentConfig) -> list[str]:
+    """The cameras of a config that its driver emulates and that show the twin's sky, for a person."""
+    sections = (("star_camera", config.star_camera), ("reflector_camera", config.reflector_camera))
+    return [
+        f"{entry} ({section.device.driver}): emulated, shown the twin's sky"
+        for entry, section in sections
+        if section.device is not None and section.device.fed_by_twin
+    ]
+
+
 def answering_servers(wanted: Sequence[WantedDevice], timeout_s: float = 1.0) -> set[tuple[str, int]]:
     """Those of the servers named that can be connected to."""
     found = set()
@@ -238,6 +252,7 @@ def as_json(inventory: Inventory) -> dict[str, Any]:
             for device in inventory.usb.devices
         ],
         "warnings": list(inventory.usb.warnings),
+        "emulated": list(inventory.emulated),
         "missing": inventory.missing,
     }
 

@@ -15,6 +15,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from namod_ctl.app.views.number_ranges import counted
 from namod_ctl.core.units import rad_to_arcmin, rad_to_deg
 from namod_ctl.cycle.coverage import Coverage, cell_of
 from namod_ctl.cycle.progress import Progress
@@ -68,7 +69,7 @@ def plain_line(progress: Progress, *, has_estimate: bool = True) -> str:
     parts = [
         f"{progress.n_accepted}{wanted} records",
         f"{sum(progress.rejected.values())} rejected",
-        f"{sum(progress.source.dropped.values())} frames retaken",
+        f"{counted(sum(progress.source.dropped.values()), 'frame')} retaken",
         f"{progress.rate_per_min:.0f} per minute",
         f"star {star_brightness(progress)}",
         f"coverage {progress.coverage.share:.0%}",
@@ -130,7 +131,7 @@ def _panel(progress: Progress, title: str, *, has_estimate: bool) -> RenderableT
         "exposures", f"star {_exposure(progress.star_exposure_s)}, reflector {_exposure(progress.reflector_exposure_s)}"
     )
     numbers.add_row("star", star_brightness(progress))
-    rejected = ", ".join(f"{n} {reason.value}" for reason, n in progress.rejected.items())
+    rejected = ", ".join(f"{n} {reason.value.replace('_', ' ')}" for reason, n in progress.rejected.items())
     numbers.add_row("rejected", rejected or "none")
     dropped = ", ".join(f"{n} {cause.value}" for cause, n in progress.source.dropped.items())
     numbers.add_row("retaken", dropped or "none")
@@ -157,7 +158,7 @@ def _uncertainty(progress: Progress) -> str:
     if estimate is None:
         return "no estimate yet"
     unseen = estimate.unseen_facet_ids
-    without = f"{len(unseen)} facets not seen; " if unseen else ""
+    without = f"{counted(len(unseen), 'facet')} not seen; " if unseen else ""
     if not math.isfinite(estimate.worst_uncertainty_rad):
         return f"not known yet ({without}{estimate.n_records} records)"
     worst_arcmin = rad_to_arcmin(estimate.worst_uncertainty_rad)

@@ -77,6 +77,16 @@ def test_what_is_beyond_the_limits_is_refused_with_the_numbers() -> None:
     result = called("move", "13.1", "--to-mm", "7.0", "--twin", "--yes")
     assert result.exit_code == 1
     assert "refused" in result.output
+    assert "arrived" not in result.output
+
+
+def test_what_is_refused_is_told_before_anybody_is_asked() -> None:
+    result = called("jog", "13.1", "--by-mm", "50", "--twin", answer="")
+    assert result.exit_code == 1  # the answer is not missed, as there is no question
+    assert "Go on?" not in result.output
+    assert "50.0000 mm is more than the" in result.output
+    assert "cycle" not in result.output
+    assert "nothing was moved" in result.output
 
 
 def test_home_stop_and_selftest() -> None:

@@ -73,6 +73,26 @@ def test_a_turned_and_mirrored_camera_is_told_in_words(
     assert "warning: no map of facets" in text
 
 
+def test_the_devices_of_the_cameras_are_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, out, _ = _run(monkeypatch, capsys, "config", "check", "fact")
+    assert out.count("none: the digital twin") == 2
+    assert "has no device" not in out
+    _, out, _ = _run(monkeypatch, capsys, "config", "check", "bench_pylon")
+    assert out.count("pylon, emulated: shown the twin's sky") == 2
+    path = tmp_path / "half.toml"
+    path.write_text(
+        f'extends = "{builtin_folder() / "fact.toml"}"\n'
+        '[star_camera]\nserial_number = "21979447"\n[star_camera.device]\ndriver = "pylon"\n'
+    )
+    code, out, _ = _run(monkeypatch, capsys, "config", "check", str(path))
+    text = " ".join(out.split())
+    assert code == 0
+    assert "pylon, serial number 21979447" in text
+    assert "warning: reflector_camera has no device, the other camera has one" in text
+
+
 def test_all_builtin_configs_are_listed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     code, out, _ = _run(monkeypatch, capsys, "config", "list")
     assert code == 0

@@ -156,7 +156,8 @@ def test_done_goes_to_who_is_at_work(namod_ctl: Call, campaign: Path) -> None:
     with at_work(campaign, say_ok) as taken:
         assert namod_ctl("done", campaign, "--facet", "31, 13,31").code == 0
         assert namod_ctl("done", campaign, "--all").code == 0
-    assert [request.facet_ids for request in taken] == [(31, 13), "all"]
+        assert namod_ctl("done", campaign, "--facet", "13, 2 to 4,31-32").code == 0  # as status prints them
+    assert [request.facet_ids for request in taken] == [(31, 13), "all", (13, 2, 3, 4, 31, 32)]
     with CampaignStore.open(campaign) as store:  # to mark them is the business of who is at work
         assert [turns.is_done for turns in store.turns()] == [False, False]
 

@@ -5,8 +5,11 @@ from __future__ import annotations
 import asyncio
 import json
 import math
+import os
 import shutil
 import socket
+import subprocess
+import sys
 import threading
 import time
 import urllib.error
@@ -22,6 +25,7 @@ from dashboard_samples import TOKEN, new_campaign, new_run, record
 from typer.testing import CliRunner
 
 from namod_ctl.app.commands.dashboard import dashboard
+from namod_ctl.app.dashboard.addresses import own_addresses
 from namod_ctl.app.dashboard.beside import dashboard_beside
 from namod_ctl.app.dashboard.feed import Feed
 from namod_ctl.app.dashboard.guard import Rules
@@ -250,6 +254,68 @@ def test_dashboard_beside_a_recording_is_served_and_ends_with_it(tmp_path: Path)
             run.append([record(0, len(run.facet_ids))])  # nobody is in the way
         with pytest.raises(urllib.error.URLError):
             urllib.request.urlopen(address, timeout=5.0)
+
+
+BESIDE = """
+import sys, time
+from pathlib import Path
+from namod_ctl.app.dashboard.beside import dashboard_beside
+if __name__ == "__main__":
+    with dashboard_beside(Path(sys.argv[1])) as address:
+        print(address, flush=True)
+        time.sleep(60.0)
+"""
+
+
+def is_served(address: str) -> bool:
+    try:
+        urllib.request.urlopen(address, timeout=5.0).close()
+    except OSError:
+        return False
+    return True
+
+
+def test_page_beside_a_program_that_is_killed_ends_with_it(tmp_path: Path) -> None:
+    with new_run(tmp_path / "R"):
+        pass
+    (tmp_path / "beside.py").write_text(BESIDE)
+    with subprocess.Popen(
+        [sys.executable, str(tmp_path / "beside.py"), str(tmp_path / "R")],
+        stdout=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"NAMOD_CTL_TOKEN": "a-token-of-the-night"},
+    ) as program:
+        assert program.stdout is not None
+        address = program.stdout.readline().strip()
+        try:
+            assert address.endswith("#token=a-token-of-the-night")
+            with urllib.request.urlopen(address, timeout=30.0) as answer:
+                assert answer.status == 200
+        finally:
+            program.kill()
+    deadline_s = time.monotonic() + 20.0
+    while is_served(address):
+        assert time.monotonic() < deadline_s, "the page has outlived its program"
+
+
+def test_token_of_the_environment_that_can_be_guessed_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NAMOD_CTL_TOKEN", "short")
+    with pytest.raises(ConfigError, match="NAMOD_CTL_TOKEN"), dashboard_beside(tmp_path):
+        pass
+
+
+def test_addresses_are_those_that_the_system_names() -> None:
+    hostname = shutil.which("hostname")
+    if hostname is None:
+        pytest.skip("there is no program `hostname` to compare with")
+    listed = subprocess.run([hostname, "-I"], capture_output=True, text=True, check=False)
+    if listed.returncode != 0:
+        pytest.skip("this `hostname` lists no addresses")
+    expected = {address for address in listed.stdout.split() if ":" not in address}
+    assert set(own_addresses()) <= expected
+    assert bool(own_addresses()) == bool(expected)
 
 
 def test_wrong_start_is_said_in_words(tmp_path: Path) -> None:

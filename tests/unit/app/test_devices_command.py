@@ -182,6 +182,17 @@ def test_the_command_in_json_and_for_people(tmp_path: Path, monkeypatch: pytest.
     assert {d["driver"] for d in data["drivers"] if d["remark"]} == {"ueye"}
 
 
+def test_cameras_that_show_the_twins_sky_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    known = inventory()
+    monkeypatch.setattr(command, "list_all_cameras", lambda: known.listings)
+    monkeypatch.setattr(command, "list_serial_ports", lambda: known.ports)
+    monkeypatch.setattr(command, "read_usb_tree", lambda: known.usb)
+    told = CliRunner().invoke(app, ["devices", "--config", "bench_pylon"], env={"COLUMNS": "160"}).output
+    for entry in ("star_camera", "reflector_camera"):
+        assert f"{entry} (pylon): emulated, shown the twin's sky" in told
+    assert "emulated" not in CliRunner().invoke(app, ["devices", "--config", "fact"]).output
+
+
 def test_json_is_the_same_as_the_inventory() -> None:
     data = as_json(inventory(WantedDevice("star_camera", "opencv", "", "0")))
     assert json.loads(json.dumps(data)) == data

@@ -72,7 +72,17 @@ def test_the_page_and_all_it_needs_come_from_here(editor):
     assert status == 200
     assert b"http" not in body.replace(b"http-equiv", b"")  # no address of another host
     assert "default-src 'none'" in headers["content-security-policy"]
-    for name in ("editor.js", "board.js", "model.js", "server.js", "editor.css", "icon.svg", "picture.png", "map"):
+    for name in (
+        "editor.js",
+        "board.js",
+        "model.js",
+        "server.js",
+        "theme.js",
+        "editor.css",
+        "icon.svg",
+        "picture.png",
+        "map",
+    ):
         assert request(editor, "GET", f"/{name}")[0] == 200
 
 

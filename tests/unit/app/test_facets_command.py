@@ -60,6 +60,12 @@ def test_a_config_of_ones_own_keeps_its_map(tmp_path, picture):
     polygons = {polygon.facet_id: np.array(polygon.corners_px) for polygon in load_config(config).polygons}
     _, outlines = truth(tmp_path)
     assert max(np.abs(polygons[i] - outlines[i]).max() for i in outlines) < 0.6
+    assert "fact_polygons.csv.bak" in done.output  # what was there before is kept, and never replaced
+    assert (tmp_path / "fact_polygons.csv.bak").read_text() == (builtin_folder() / "fact_polygons.csv").read_text()
+    first = (tmp_path / "fact_polygons.csv").read_bytes()
+    again = run("propose", "--image", picture, "--config", config, "--marks", write_marks(tmp_path), "--no-edges")
+    assert again.exit_code == 0, again.output
+    assert (tmp_path / "fact_polygons.csv.bak2").read_bytes() == first
 
 
 def test_a_config_whose_map_is_still_to_be_made(tmp_path, picture):

@@ -146,10 +146,24 @@ def test_the_report_is_for_people(run, namod_ctl):
     assert namod_ctl("reconstruct", run).returncode == 0
     report = (run / "report.txt").read_text()
     assert f"{len(FACET_IDS)} facets, {N_RECORDS} records" in report
-    for words in ("A_sigma", "ray-traced limit", "predicted after correction", "this run does not have", "no estimate"):
+    for words in (
+        "A_sigma",
+        "limit of mirrors without figure errors (ray-traced)",
+        "predicted after correction",
+        "this run does not have",
+        "no estimate",
+    ):
         assert words in report
     assert "NO_SIGNAL" in report
     assert "nan" not in report.lower()
+
+
+def test_instructions_of_an_older_estimate_are_removed_and_that_is_said(run, namod_ctl):
+    assert "older reconstruction" not in namod_ctl("reconstruct", run).stdout
+    (run / "instructions.csv").write_text("facet_id\n")
+    done = namod_ctl("reconstruct", run)
+    assert "of an older reconstruction and are removed" in done.stdout
+    assert not (run / "instructions.csv").exists()
 
 
 def test_a_second_estimate_replaces_the_files(run, namod_ctl):

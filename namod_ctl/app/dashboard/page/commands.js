@@ -1,8 +1,8 @@
-// Commands: who has the token may give them. To stop needs one confirmation and is always in sight.
+// Commands: who has the token may give them. To stop is always in sight; that and to refuse need one confirmation.
 
 import { byId, element, nextMessage, setText } from "./dom.js";
 
-const WORDS = { pause: "Pause", resume: "Resume", approve: "Approve the correction", refuse: "Refuse it" };
+const WORDS = { pause: "Pause", resume: "Resume", approve: "Approve the correction", refuse: "Refuse: nothing moves, the campaign is held" };
 const KEY = "namod-token";
 
 let isCampaign = false;
@@ -20,10 +20,6 @@ function stored(value) {
 
 export function setUpCommands(about) {
   isCampaign = about.kind === "campaign";
-  setText(byId("h-stop"), isCampaign ? "Stop everything?" : "Stop the recording?");
-  setText(byId("stop-means"), isCampaign
-    ? "All drives halt at once. The campaign is held until somebody has looked at the telescope and releases it."
-    : "The recording ends after the record in work. All its records are kept.");
   const given = new URLSearchParams(location.hash.slice(1)).get("token");
   token = given ? stored(given) || given : token || stored();
   if (given) history.replaceState(null, "", location.pathname); // so that nobody reads it over a shoulder
@@ -35,17 +31,29 @@ export function setUpCommands(about) {
     byId("token").value = "";
     showTokenForm();
   };
-  const dialog = byId("stop-dialog");
-  byId("stop").onclick = () => (canStop() ? dialog.showModal() : say(whyNot()));
-  byId("stop-no").onclick = () => dialog.close();
-  byId("stop-yes").onclick = () => {
-    dialog.close();
-    send({ kind: "stop" });
-  };
+  // whatever the page believes: it may be half a second late, and the program itself knows best
+  byId("stop").onclick = () => confirm(stopInWords(), () => send({ kind: "stop" }));
+  byId("stop-no").onclick = () => byId("stop-dialog").close();
 }
 
-const canStop = () => standing?.commands.includes("stop");
-const whyNot = () => (isCampaign ? "Nobody is at work on this campaign: there is nothing to stop." : "Nobody records this at the moment: there is nothing to stop.");
+const stopInWords = () => (isCampaign
+  ? ["Stop everything?", "All drives halt at once. The campaign is held until somebody has looked at the telescope and releases it.", "Stop now"]
+  : ["Stop the recording?", "The recording ends after the record in work. All its records are kept.", "Stop now"]);
+const REFUSE_IN_WORDS = ["Refuse the correction?", "Nothing moves. The campaign is held: it goes on only when somebody says 'namod-ctl release' in a terminal.", "Refuse it"];
+
+function confirm([title, means, yes], act) {
+  const dialog = byId("stop-dialog");
+  setText(byId("h-stop"), title);
+  setText(byId("stop-means"), means);
+  setText(byId("stop-yes"), yes);
+  byId("stop-yes").onclick = () => {
+    dialog.close();
+    act();
+  };
+  dialog.showModal();
+}
+
+const seemsToStop = () => standing?.commands.includes("stop");
 
 function showTokenForm() {
   byId("token-form").hidden = token !== "" || !standing?.commands.length;
@@ -53,7 +61,7 @@ function showTokenForm() {
 
 export function showCommands(now) {
   standing = now;
-  byId("stop").setAttribute("aria-disabled", String(!canStop()));
+  byId("stop").setAttribute("aria-disabled", String(!seemsToStop()));
   showTokenForm();
   const wanted = now.commands.filter((kind) => kind in WORDS);
   const group = byId("commands");
@@ -61,7 +69,8 @@ export function showCommands(now) {
   group.dataset.kinds = wanted.join();
   group.replaceChildren(...wanted.map((kind) => {
     const button = element("button", { type: "button", "data-kind": kind }, WORDS[kind]);
-    button.addEventListener("click", () => send({ kind, step: standing.step }));
+    const give = () => send({ kind, step: standing.step });
+    button.addEventListener("click", kind === "refuse" ? () => confirm(REFUSE_IN_WORDS, give) : give);
     return button;
   }));
 }

@@ -1,6 +1,6 @@
 // One facet: its light over star directions, its history, its legs, and what stands against it.
 
-import { legState } from "./campaign.js";
+import { legState, planInWords } from "./campaign.js";
 import { colour } from "./colours.js";
 import { byId, drawn, element, ellipseMark, number, setNumbers, setText } from "./dom.js";
 import { markChosen, whenChosen } from "./mirror.js";
@@ -20,7 +20,12 @@ export function setUpFacet(about) {
   choice.replaceChildren(...ids.map((id) => element("option", { value: id }, String(id))));
   choice.onchange = () => choose(Number(choice.value));
   whenChosen(choose);
-  if (!ids.includes(chosen) && ids.length) choose(ids[0]);
+  if (!ids.includes(chosen)) {
+    if (ids.length) choose(ids[0]);
+    return;
+  }
+  choice.value = String(chosen); // the mirror is drawn anew after every loss of the connection
+  markChosen(chosen);
 }
 
 function choose(id) {
@@ -64,12 +69,12 @@ export function showFacetDetails(known) {
   const pairs = [];
   if (facet) {
     const isKnown = facet.off_arcmin !== null;
-    pairs.push(["off by", isKnown ? size(facet) : "not known"]);
+    pairs.push(["its normal is off by", isKnown ? size(facet) : "not known"]);
     if (facet.width_arcmin[0] !== null) pairs.push(["image", `${number(facet.width_arcmin[0])} × ${number(facet.width_arcmin[1])} arcmin`]);
     if (facet.n_records !== null) pairs.push(["records in it", String(facet.n_records)]);
     if (facet.history.length > 1) pairs.push(["by cycle", facet.history.map(([cycle, off]) => `${cycle}: ${number(off)}`).join(", ")]);
   }
-  for (const leg of legs) pairs.push([`leg ${leg.leg}`, `${leg.position_mm === null ? "where is not known" : `${number(leg.position_mm, 3)} mm`}; ${legState(leg)}`]);
+  for (const leg of legs) pairs.push([`leg ${leg.leg}`, `${leg.position_mm === null ? "where is not known" : `${number(leg.position_mm, 3)} mm`}; ${[planInWords(leg), legState(leg)].filter((text) => text).join("; ")}`]);
   setNumbers(byId("facet-numbers"), pairs);
   const remarks = [...(facet?.flags.map((flag) => flag.meaning) ?? []), ...(facet?.remarks ?? [])];
   if (refused) remarks.push(`stays as it is: ${refused.why}`);

@@ -54,10 +54,10 @@ export function showFacets({ of, table }) {
     node.setAttribute("class", `facet${isKnown ? "" : " unknown"}${facet.is_refused ? " refused" : ""}`);
     node.style.fill = isKnown ? colour(facet.off_arcmin / most) : "";
     const flags = facet.flags.map((flag) => flag.meaning).join("; ");
-    node.setAttribute("aria-label", `facet ${facet.id}, ${isKnown ? `off by ${number(facet.off_arcmin)} arcmin` : "not known"}${flags ? `, ${flags}` : ""}`);
+    node.setAttribute("aria-label", `facet ${facet.id}, ${isKnown ? `its normal is off by ${number(facet.off_arcmin)} arcmin` : "not known"}${flags ? `, ${flags}` : ""}`);
   }
   paintScale(byId("mirror-scale"));
-  setText(byId("mirror-key"), `off by 0 to ${most} arcmin; dashed: not to be moved. As the reflector camera sees it, from the front.`);
+  setText(byId("mirror-key"), `normals off by 0 to ${most} arcmin; dashed: not to be moved. As the reflector camera sees it, from the front.`);
 }
 
 export function showMirrorPicture(now) {

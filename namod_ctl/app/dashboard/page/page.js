@@ -1,6 +1,6 @@
 // The page: sections arrive as server-sent events, each goes to the module that draws it.
 
-import { showActuators, showJournal } from "./campaign.js";
+import { showActuators, showJournal, showPreview } from "./campaign.js";
 import { setUpCommands, showCommands } from "./commands.js";
 import { showCoverage } from "./coverage.js";
 import { showCycles } from "./cycles.js";
@@ -56,6 +56,10 @@ const draw = {
     showActuators(actuators);
     showFacetDetails(known);
   },
+  preview(preview) {
+    showPreview(preview);
+    showFacetDetails(known);
+  },
   journal: showJournal,
   sheets: showSheets,
   trouble(text) {
@@ -74,12 +78,18 @@ function showBanner(text) {
   setText(byId("banner"), text);
 }
 
+function howToLookAgain() {
+  if (!known.about) return ""; // a page beside a recording ends with it, and what was recorded stays to be seen
+  const name = known.about.name;
+  return ` To look again: namod-ctl dashboard ${/^[\w.-]+$/.test(name) ? name : `'${name.replaceAll("'", "'\\''")}'`}`;
+}
+
 function listen() {
   const source = new EventSource("/events");
   for (const name of Object.keys(draw)) source.addEventListener(name, (event) => receive(name, event.data));
   source.onopen = () => showBanner("");
   source.onerror = () => {
-    showBanner("No connection to the page's program: what stands here is old. Trying again.");
+    showBanner(`No connection to the page's program: what stands here is old. Trying again.${howToLookAgain()}`);
     if (source.readyState === EventSource.CLOSED) setTimeout(listen, 2000);
   };
 }

@@ -11,8 +11,7 @@ export class Picture {
     this.begun = -Infinity;
     this.timer = 0;
     this.isBusy = false;
-    image.addEventListener("load", () => { image.hidden = false; onShown(this.markFetched); this.done(); });
-    image.addEventListener("error", () => this.done());
+    this.onShown = onShown;
   }
 
   show(now, mark = null) { // `mark` belongs to this frame: it is handed back when the frame is to be seen
@@ -37,7 +36,18 @@ export class Picture {
     this.isBusy = true;
     this.begun = performance.now();
     [this.fetched, this.markFetched] = [this.wanted, this.mark];
-    this.image.src = this.wanted;
+    // beside the one that is shown, which stays when the frame has gone meanwhile: the recorder keeps its newest only
+    const next = Object.assign(new Image(), { id: this.image.id, alt: this.image.alt, className: this.image.className });
+    next.addEventListener("load", () => { this.take(next); this.done(); });
+    next.addEventListener("error", () => this.done());
+    next.src = this.wanted;
+  }
+
+  take(next) {
+    next.hidden = !this.isKept;
+    this.image.replaceWith(next);
+    this.image = next;
+    this.onShown(this.markFetched);
   }
 
   done() {

@@ -16,6 +16,8 @@ let chosen = null; // facet id
 let places = new Map(); // facet id -> {node, tick} of the map and {button} of the list
 let isCampaign = true;
 let markChosen = () => {};
+let buttonsOf = null; // the facet that Done and Undo were last shown for
+const REST_MS = 1500; // a second tap on Done, however slow, takes no mark back
 
 export function setUpSheet(about) {
   isCampaign = about.kind === "campaign";
@@ -23,8 +25,16 @@ export function setUpSheet(about) {
   byId("sheet-before").onclick = () => step(-1);
   byId("sheet-after").onclick = () => step(1);
   byId("sheet-next").onclick = () => choose(nextToDo());
-  byId("sheet-done").onclick = () => send({ kind: "done", facets: [chosen], step: standing.step }, reply);
-  byId("sheet-undo").onclick = () => send({ kind: "not_done", facets: [chosen], step: standing.step }, reply);
+  for (const [id, kind] of [["sheet-done", "done"], ["sheet-undo", "not_done"]]) {
+    byId(id).onclick = () => { if (byId(id).ariaDisabled !== "true") send({ kind, facets: [chosen], step: standing.step }, reply); };
+  }
+}
+
+// a button that takes another one's place under the finger does nothing at first
+function letRest(button) {
+  button.ariaDisabled = "true";
+  clearTimeout(button.rest);
+  button.rest = setTimeout(() => { button.ariaDisabled = "false"; }, REST_MS);
 }
 
 const reply = (text) => nextMessage(byId("sheet-reply"), text);
@@ -150,8 +160,14 @@ function showButtons(facet, marked, left) {
   setText(no, `Undo: facet ${facet.id} is not done`);
   next.hidden = !canMark() || !left.some((each) => each !== facet);
   const held = document.activeElement;
+  const wasHidden = new Map([yes, no].map((button) => [button, button.hidden]));
   yes.hidden = !isAsked || marked.has(facet.id);
   no.hidden = !isAsked || !marked.has(facet.id);
+  for (const [button, other] of [[yes, no], [no, yes]]) {
+    if (buttonsOf !== facet.id) button.ariaDisabled = "false";
+    else if (wasHidden.get(button) && !button.hidden && !wasHidden.get(other)) letRest(button);
+  }
+  buttonsOf = facet.id;
   if (held === yes && yes.hidden) (next.hidden ? no : next).focus();
   else if (held === no && no.hidden && !yes.hidden) yes.focus();
   const at = facets.indexOf(facet);
