@@ -9,11 +9,14 @@ Facet tilt t = (t_x, t_y): the facet's normal is its aligned normal + (t_x, t_y,
 Theta = 2 t, so the correction that is added to the normal is Phi = -Theta / 2.
 
 Pixels: (x, y) = (column, row), centre of the first pixel at (0, 0).
+
+Turns of bolts are positive clockwise, as seen by the person who turns.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +27,16 @@ Array = NDArray[np.float64]
 def correction_of_theta(theta_rad: Array) -> Array:
     """Phi, to be added to the facet's normal, for a facet that is brightest at `theta_rad`; (..., 2), rad."""
     return -theta_rad / 2.0
+
+
+def factors_to_view(seen_from: Literal["front", "back"]) -> Array:
+    """Shape (2,). Factors of telescope x and y that give right and up as a person on that side of the mirror sees."""
+    return np.array([-1.0 if seen_from == "back" else 1.0, 1.0])
+
+
+def sense_of_turn(turn_deg: float) -> Literal["clockwise", "counterclockwise"]:
+    """The way a person turns a bolt by `turn_deg`, which is not 0."""
+    return "clockwise" if turn_deg > 0 else "counterclockwise"
 
 
 def theta_of_hit(hit_m: Array, focal_length_m: float, theta_rad: Array) -> Array:

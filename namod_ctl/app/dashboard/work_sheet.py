@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from namod_ctl.app.sheets.facet_map import outlines_m
 from namod_ctl.app.sheets.instructions import FacetInstruction, Verdict, facet_instructions
 from namod_ctl.app.sheets.ladder_sheets import plan_sheets, turn_in_words
+from namod_ctl.optics.coordinates import factors_to_view, sense_of_turn
 from namod_ctl.optics.instrument import Instrument
 from namod_ctl.optics.mounts import Mount
 from namod_ctl.reconstruction.alignment import Alignment
@@ -33,7 +34,7 @@ def work_sheet(instrument: Instrument, alignment: Alignment, done: Sequence[int]
     instructions = facet_instructions(alignment, instrument.goniometer_resolution_rad)
     by_id = {instruction.facet_id: instruction for instruction in instructions}
     seen_from = instrument.bolts_seen_from
-    to_view = np.array([-1.0 if seen_from == "back" else 1.0, 1.0])
+    to_view = factors_to_view(seen_from)
     outlines = {facet_id: to_view * outline for facet_id, outline in outlines_m(instrument.reflector).items()}
     sheets = plan_sheets(instrument.reflector, list(by_id), seen_from)
     return {
@@ -86,10 +87,10 @@ def _facet(instruction: FacetInstruction, mount: Mount, to_view: Array, outline_
 
 
 def _bolt(turn_deg: float) -> dict[str, str]:
-    """A turn in words; positive is clockwise as seen by the person who turns (`Mount.turn_deg_of_travel`)."""
+    """A turn in words."""
     if turn_deg == 0:
         return {"turn": "leave", "sense": ""}
-    return {"turn": turn_in_words(abs(turn_deg)), "sense": "clockwise" if turn_deg > 0 else "counterclockwise"}
+    return {"turn": turn_in_words(abs(turn_deg)), "sense": sense_of_turn(turn_deg)}
 
 
 def _rounded(points_m: Array) -> list[list[float]]:

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from namod_ctl.app.sheets.facet_map import outlines_m
 from namod_ctl.app.sheets.instructions import FacetInstruction, Verdict
+from namod_ctl.optics.coordinates import factors_to_view, sense_of_turn
 from namod_ctl.optics.instrument import Instrument
 from namod_ctl.optics.mounts import Mount
 from namod_ctl.optics.reflector import Reflector
@@ -60,7 +61,7 @@ def plan_sheets(
     of the ladder lie the facets whose centres are within 0.75 of a facet's width; where these are more than
     fit on a sheet, they are split into sheets of equal length.
     """
-    to_view = _to_view(seen_from)
+    to_view = factors_to_view(seen_from)
     positions = {facet.id: to_view * facet.position_m[:2] for facet in reflector.facets}
     reach_m = _REACH_IN_FACETS * float(np.median([facet.width_m for facet in reflector.facets]))
     from_left = sorted(facet_ids, key=lambda facet_id: float(positions[facet_id][0]))
@@ -76,11 +77,6 @@ def plan_sheets(
         parts = np.array_split(np.array(upwards), n_sheets)
         sheets += [Sheet(number, tuple(int(facet_id) for facet_id in part)) for part in parts]
     return tuple(sheets)
-
-
-def _to_view(seen_from: Literal["front", "back"]) -> Array:
-    """Factors of telescope x and y that give right and up as a person sees them."""
-    return np.array([-1.0 if seen_from == "back" else 1.0, 1.0])
 
 
 def sheets_to_pdf(
@@ -105,7 +101,7 @@ def _pages(
         yield page
         return
     by_id = {instruction.facet_id: instruction for instruction in instructions}
-    to_view = _to_view(instrument.bolts_seen_from)
+    to_view = factors_to_view(instrument.bolts_seen_from)
     outlines = {facet_id: to_view * outline for facet_id, outline in outlines_m(instrument.reflector).items()}
     sheets = plan_sheets(instrument.reflector, list(by_id), instrument.bolts_seen_from)
     for number, sheet in enumerate(sheets, start=1):
@@ -197,7 +193,7 @@ def _draw_table(axes: Axes, instrument: Instrument, instructions: Sequence[Facet
     top_mm = _TABLE_TOP_MM
     for instruction in to_do:
         mount = instrument.mounts[instruction.facet_id]
-        _draw_row(axes, mount, _to_view(instrument.bolts_seen_from), instruction, top_mm, row_mm)
+        _draw_row(axes, mount, factors_to_view(instrument.bolts_seen_from), instruction, top_mm, row_mm)
         top_mm -= row_mm
     if not forbidden:
         return
@@ -260,7 +256,7 @@ def _draw_turn(axes: Axes, x_mm: float, y_mm: float, bolt: int, turn_deg: float,
         axes.add_patch(Circle((float(centre[0]), y_mm), 0.8 * radius_mm, fc="none", ec="0.6", lw=1.0))
         _write(axes, x_mm, y_mm, "leave", 13 * scale, va="center")
         return
-    sense = "clockwise" if turn_deg > 0 else "counterclockwise"
+    sense = sense_of_turn(turn_deg)
     _draw_round_arrow(axes, centre, radius_mm, is_clockwise=sense == "clockwise", scale=scale)
     words = turn_in_words(abs(turn_deg))
     size_pt = min(15.0, 112.0 / len(words)) * scale  # `12 turns + 345°` still fits beside the next bolt
