@@ -129,3 +129,19 @@ def test_the_rule_of_uncertainty_stops_where_the_estimate_was_due(path: Path, mo
         reason = recorder.record(StopRule(uncertainty_rad=1e-4, n_records=2 * DUE_AT))
     assert "known well enough" in reason
     assert recorder.progress().n_accepted == DUE_AT
+
+
+def test_a_hole_in_the_region_asks_for_more_records_but_not_for_ever(tmp_path: Path) -> None:
+    rule = StopRule(n_records=50, min_coverage=0.8)
+    progress = some_progress(lambda p: replace(p, n_accepted=50), tmp_path)
+    counts = np.ones_like(progress.coverage.counts)
+    covered = replace(progress, coverage=replace(progress.coverage, counts=counts))
+    counts = counts.copy()
+    counts[5:7, 5:7] = 0  # 4 of 97 cells, where all facets look once they were aligned
+    holed = replace(progress, coverage=replace(progress.coverage, counts=counts))
+    assert rule.reason_to_stop(covered) != ""
+    assert holed.coverage.share > rule.min_coverage
+    assert rule.reason_to_stop(holed) == ""
+    assert rule.reason_to_stop(replace(holed, n_accepted=149)) == ""
+    assert "to cover the region" in rule.reason_to_stop(replace(holed, n_accepted=150))
+    assert StopRule(n_records=50).reason_to_stop(holed) == "all records wanted are there"
