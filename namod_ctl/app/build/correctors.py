@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from pathlib import Path
 
 from namod_ctl.app.alignment_files import alignment_files, alignment_from_json, alignment_to_json
@@ -14,7 +14,7 @@ from namod_ctl.app.reconstruction_report import REPORT_FILE, report_text
 from namod_ctl.app.sheets.ladder_sheets import PDF_FILE
 from namod_ctl.core.drives import DriveState, Leg
 from namod_ctl.core.errors import StoreError
-from namod_ctl.core.interfaces import Camera, MonotonicClock
+from namod_ctl.core.interfaces import MonotonicClock
 from namod_ctl.core.motion import StopSwitch
 from namod_ctl.core.units import deg_to_rad
 from namod_ctl.cycle.campaign_parts import Outside
@@ -68,26 +68,9 @@ def correct_by_motors(
     return MotorCorrector(store, instrument, mover, drives, motion, clock)
 
 
-def campaign_outside(stack: ExitStack, open_equipment: Callable[[], Equipment]) -> Outside:
-    """What a campaign needs from above: its cameras, and the files of its results.
-
-    Cameras are let go before they are opened anew, and with the stack: a recording that finds itself complete has not
-    begun, and closes none.
-    """
-    opened: list[Camera] = []
-
-    def let_go() -> None:
-        while opened:
-            opened.pop().close()
-
-    def open_anew() -> Equipment:
-        let_go()
-        equipment = open_equipment()
-        opened.extend((equipment.star_camera, equipment.reflector_camera))
-        return equipment
-
-    stack.callback(let_go)
-    return Outside(open_anew, alignment_to_json, alignment_from_json, _write_cycle)
+def campaign_outside(open_equipment: Callable[[], Equipment]) -> Outside:
+    """What a campaign needs from above: its cameras, opened anew for each recording, and the files of its results."""
+    return Outside(open_equipment, alignment_to_json, alignment_from_json, _write_cycle)
 
 
 def _write_cycle(run: Path, result: Reconstruction) -> None:

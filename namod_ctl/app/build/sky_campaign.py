@@ -71,6 +71,6 @@ def open_sky_campaign(
         else:
             buses = stack.enter_context(open_actuators(config))
             corrector = correct_by_motors(store, config, instrument, buses, seconds, switch)
-        outside = campaign_outside(stack, lambda: Equipment(*open_cameras(config, seconds), seconds, SystemClock()))
+        outside = campaign_outside(lambda: Equipment(*open_cameras(config, seconds), seconds, SystemClock()))
         record = replace(build_record_settings(config), keep_frames=wishes.record.keep_frames)
         yield Campaign(store, instrument, corrector, outside, replace(wishes, record=record), clock, switch, view)

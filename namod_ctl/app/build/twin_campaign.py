@@ -64,7 +64,7 @@ def open_twin_campaign(
             region_radius_rad=settings.telescope.radius_rad,
             keep_frames=wishes.record.keep_frames,
         )
-        outside = campaign_outside(stack, stack.enter_context(twin_equipment(config, twin)))
+        outside = campaign_outside(stack.enter_context(twin_equipment(config, twin)))
         if config.actuators is None:
             operator = TwinOperator(twin, seed, mistakes=mistakes)
             corrector = correct_by_people(store, twin.instrument, operator.turn)
