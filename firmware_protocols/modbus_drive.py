@@ -320,12 +320,6 @@ class RegisterImage:
         self._map.registers[name].encode_raw(raw)
         self._raws[name] = raw
 
-    def set_condition(self, name: str, holds: bool) -> None:
-        """Set the bits of a condition's terms so that it holds, or invert them so that it does not."""
-        for term in self._map.conditions[name].terms:
-            bits = term.value if holds else term.value ^ term.mask
-            self[term.register] = (int(self._raws[term.register]) & ~term.mask) | bits
-
     def holds(self, name: str) -> bool:
         """Whether a condition is true now."""
         return self._map.conditions[name].holds(self._raws)

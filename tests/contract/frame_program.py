@@ -6,6 +6,7 @@ It is a program of its own, on purpose without a line of the project: FITS by as
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import threading
 from collections.abc import Callable
@@ -94,3 +95,13 @@ class FrameProgram:
         """The pixels, when the exposure is over; at once at the end of the program."""
         self._is_over.wait(exposure_s)
         return self._pixels
+
+
+def bytes_of(pixels: np.ndarray, ending: str) -> bytes:
+    """A whole file of grey pixels of 8 bit, exposed for 0.01 s."""
+    data = io.BytesIO()
+    if ending == ".fits":
+        fits.PrimaryHDU(pixels, fits.Header({"EXPTIME": 0.01})).writeto(data)
+    else:
+        Image.fromarray(pixels).save(data, {".png": "PNG", ".tif": "TIFF"}[ending])
+    return data.getvalue()

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import io
 import json
-import math
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -13,20 +12,15 @@ from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from astropy.io import fits
 from camera_contract import CameraContract, CameraRig
-from frame_program import FrameProgram, write_fits, write_png, write_tiff
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
-from PIL import Image
+from frame_program import FrameProgram, bytes_of, write_fits, write_png, write_tiff
 
 from namod_ctl.core.clock import SystemMonotonicClock
 from namod_ctl.core.errors import CommunicationError, ConfigError, DeviceFaultError
 from namod_ctl.devices.cameras.folder_camera import FolderCamera, list_cameras
-from namod_ctl.devices.cameras.frame_files import UnfinishedFileError, read_frame_file
 from namod_ctl.devices.cameras.settings import CameraSettings
 
 COLUMNS, ROWS = 40, 30
@@ -158,7 +152,7 @@ def test_of_a_program_that_exposes_as_it_pleases_only_frames_begun_after_the_sta
 
 @pytest.mark.parametrize("ending", [".fits", ".png", ".tif"])
 def test_a_file_that_is_half_written_is_waited_for(folder: Path, ending: str) -> None:
-    whole = _bytes_of(ending)
+    whole = bytes_of(GREY, ending)
     camera = camera_of(folder)
     camera.start(0.01)
     (folder / "frame.txt").write_text("exposure_s = 0.01\n")
@@ -175,7 +169,7 @@ def test_a_file_that_is_half_written_is_waited_for(folder: Path, ending: str) ->
 
 def test_a_file_that_has_its_size_before_its_pixels_is_waited_for(folder: Path) -> None:
     """As programs do that map a file into their memory: it looks whole from the first moment on."""
-    whole = _bytes_of(".fits")
+    whole = bytes_of(GREY, ".fits")
     camera = camera_of(folder)
     camera.start(0.01)
     worker, done = fetched_later(camera)
@@ -194,110 +188,13 @@ def test_a_file_that_has_its_size_before_its_pixels_is_waited_for(folder: Path) 
 def test_what_was_missing_is_told_when_time_is_over(folder: Path) -> None:
     camera = camera_of(folder)
     camera.start(0.01)
-    (folder / "frame.png").write_bytes(_bytes_of(".png"))
+    (folder / "frame.png").write_bytes(bytes_of(GREY, ".png"))
     with pytest.raises(CommunicationError, match=r"frame\.json or frame\.txt"):
         camera.fetch(0.2)
     camera.start(0.01)
-    (folder / "cut.fits").write_bytes(_bytes_of(".fits")[:3000])
+    (folder / "cut.fits").write_bytes(bytes_of(GREY, ".fits")[:3000])
     with pytest.raises(CommunicationError, match=r"cut\.fits: 3000 bytes of 4080"):
         camera.fetch(0.2)
-
-
-def _bytes_of(ending: str) -> bytes:
-    data = io.BytesIO()
-    if ending == ".fits":
-        fits.PrimaryHDU(GREY, fits.Header({"EXPTIME": 0.01})).writeto(data)
-    else:
-        Image.fromarray(GREY).save(data, {".png": "PNG", ".tif": "TIFF"}[ending])
-    return data.getvalue()
-
-
-@pytest.mark.parametrize("ending", [".fits", ".png", ".tif"])
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=40)
-@given(data=st.data())
-def test_no_beginning_of_a_file_is_a_frame(folder: Path, ending: str, data: st.DataObject) -> None:
-    whole = _bytes_of(ending)
-    n_data = len(whole) if ending != ".fits" else 2880 + GREY.size  # what follows is only there to fill the block
-    path = folder / f"frame{ending}"
-    path.write_bytes(whole[: data.draw(st.integers(0, n_data - 1))])
-    (folder / "frame.json").write_text('{"exposure_s": 0.01}')
-    with pytest.raises(UnfinishedFileError):
-        read_frame_file(path)
-
-
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=60)
-@given(text=st.binary(max_size=40), ending=st.sampled_from([".json", ".txt"]))
-def test_any_side_file_is_understood_or_refused(folder: Path, text: bytes, ending: str) -> None:
-    for other in (".json", ".txt"):
-        (folder / "frame").with_suffix(other).unlink(missing_ok=True)
-    (folder / "frame.png").write_bytes(_bytes_of(".png"))
-    (folder / "frame").with_suffix(ending).write_bytes(text)
-    try:
-        frame = read_frame_file(folder / "frame.png")
-    except (UnfinishedFileError, CommunicationError):
-        return
-    assert 0.0 < frame.exposure_s < math.inf
-
-
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=60)
-@given(head=st.binary(max_size=3000), ending=st.sampled_from([".fits", ".png", ".tif"]), keeps=st.booleans())
-def test_any_bytes_are_a_frame_or_refused(folder: Path, head: bytes, ending: str, keeps: bool) -> None:
-    path = folder / f"frame{ending}"
-    path.write_bytes(_bytes_of(ending)[:80] + head if keeps else head)
-    (folder / "frame.json").write_text('{"exposure_s": 0.01}')
-    with pytest.raises((UnfinishedFileError, CommunicationError)):
-        read_frame_file(path)
-
-
-def test_signed_and_coloured_fits(folder: Path) -> None:
-    path = folder / "frame.fits"
-    fits.PrimaryHDU(DEEP.astype(np.int16), fits.Header({"EXPTIME": 1.0})).writeto(path)
-    assert np.array_equal(read_frame_file(path).image, DEEP)
-    planes = np.stack([COLOUR[..., 2], COLOUR[..., 1], COLOUR[..., 0]])  # red, green, blue, as FITS has them
-    fits.PrimaryHDU(planes, fits.Header({"EXPTIME": 1.0})).writeto(path, overwrite=True)
-    assert np.array_equal(read_frame_file(path).image, COLOUR)
-    fits.PrimaryHDU(DEEP.astype(np.float32), fits.Header({"EXPTIME": 1.0})).writeto(path, overwrite=True)
-    with pytest.raises(CommunicationError, match=r"BITPIX = -32.*unsigned"):
-        read_frame_file(path)
-    fits.PrimaryHDU(DEEP).writeto(path, overwrite=True)
-    with pytest.raises(CommunicationError, match="EXPTIME or EXPOSURE"):
-        read_frame_file(path)
-    fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(DEEP)]).writeto(path, overwrite=True)
-    with pytest.raises(CommunicationError, match="no image in its first part"):
-        read_frame_file(path)
-
-
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=150)
-@given(place=st.integers(0, 2879), byte=st.integers(0, 255), more=st.binary(max_size=8))
-@pytest.mark.filterwarnings("ignore")  # astropy's, about cards
-def test_a_damaged_fits_header_is_a_frame_or_refused(folder: Path, place: int, byte: int, more: bytes) -> None:
-    data = bytearray(_bytes_of(".fits"))
-    data[place] = byte
-    data[place : place + len(more)] = more
-    path = folder / "frame.fits"
-    path.write_bytes(data)
-    try:
-        frame = read_frame_file(path)
-    except (UnfinishedFileError, CommunicationError):
-        return
-    assert frame.image.dtype in (np.uint8, np.uint16)
-    assert 0.0 < frame.exposure_s < math.inf
-
-
-def test_negative_pixels_are_refused(folder: Path) -> None:
-    path = folder / "frame.fits"
-    fits.PrimaryHDU(np.full((ROWS, COLUMNS), -1, dtype=np.int16), fits.Header({"EXPTIME": 1.0})).writeto(path)
-    with pytest.raises(CommunicationError, match="negative pixels"):
-        read_frame_file(path)
-
-
-def test_sixteen_bits_in_colour_survive(folder: Path) -> None:
-    deep = np.random.default_rng(6).integers(0, 65536, (ROWS, COLUMNS, 3), dtype=np.uint16)
-    assert cv2.imwrite(str(folder / "frame.png"), deep)
-    (folder / "frame.json").write_text('{"exposure_s": 0.25}')
-    frame = read_frame_file(folder / "frame.png")
-    assert frame.exposure_s == 0.25
-    assert np.array_equal(frame.image, deep)
 
 
 @pytest.mark.parametrize(

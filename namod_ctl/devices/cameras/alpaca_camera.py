@@ -13,7 +13,7 @@ import threading
 from contextlib import suppress
 from typing import Final
 
-from namod_ctl.core.errors import CommunicationError, ConfigError, DeviceFaultError, LimitError
+from namod_ctl.core.errors import CommunicationError, ConfigError, DeviceFaultError
 from namod_ctl.core.interfaces import Exposure, MonotonicClock
 from namod_ctl.devices.cameras.alpaca_http import NETWORK_ERRORS, NOT_CONNECTED, AlpacaDevice, AlpacaImageError
 from namod_ctl.devices.cameras.alpaca_http import AlpacaRefusalError as Refusal
@@ -21,7 +21,7 @@ from namod_ctl.devices.cameras.alpaca_image import image_of_alpaca
 from namod_ctl.devices.cameras.alpaca_setup import camera_number, cameras_of, set_up
 from namod_ctl.devices.cameras.found import FoundCamera
 from namod_ctl.devices.cameras.server_address import server_address
-from namod_ctl.devices.cameras.settings import CameraSettings
+from namod_ctl.devices.cameras.settings import CameraSettings, refuse_outside
 
 DEFAULT_PORT: Final = 11111
 _POLL_S: Final = 0.02
@@ -79,12 +79,7 @@ class AlpacaCamera:
     def start(self, exposure_s: float) -> None:
         """Begin an exposure; a running one is aborted. Raises LimitError, DeviceFaultError."""
         self._refuse_gone()
-        shortest_s, longest_s = self.exposure_range_s
-        if not shortest_s <= exposure_s <= longest_s:
-            raise LimitError(
-                f"{self.name}: an exposure of {exposure_s:g} s was asked for; "
-                f"it makes {shortest_s:g} to {longest_s:g} s"
-            )
+        refuse_outside(self.name, exposure_s, self.exposure_range_s)
         self._running = None
         try:
             begin_s = self._begin(exposure_s)

@@ -36,7 +36,7 @@ from typing import Any
 import numpy as np
 
 from namod_ctl.core.clock import SystemClock
-from namod_ctl.core.errors import CommunicationError, ConfigError, DeviceFaultError, LimitError
+from namod_ctl.core.errors import CommunicationError, ConfigError, DeviceFaultError
 from namod_ctl.core.interfaces import Exposure, MonotonicClock
 from namod_ctl.devices.cameras.found import FoundCamera
 from namod_ctl.devices.cameras.frame_files import (
@@ -48,7 +48,7 @@ from namod_ctl.devices.cameras.frame_files import (
 )
 from namod_ctl.devices.cameras.new_files import NewFiles
 from namod_ctl.devices.cameras.pixel_formats import image_of
-from namod_ctl.devices.cameras.settings import CameraSettings
+from namod_ctl.devices.cameras.settings import CameraSettings, refuse_outside
 
 REQUEST_FILE = "request.json"
 MANIFEST_FILE = "camera.json"
@@ -124,12 +124,7 @@ class FolderCamera:
     def start(self, exposure_s: float) -> None:
         """Ask for an exposure, and forget all frames until now. Raises LimitError, DeviceFaultError."""
         self._refuse_when_gone()
-        shortest_s, longest_s = self._range_s
-        if not shortest_s <= exposure_s <= longest_s:
-            raise LimitError(
-                f"{self._name}: an exposure of {exposure_s:g} s was asked for; it makes {shortest_s:g} to "
-                f"{longest_s:g} s"
-            )
+        refuse_outside(self._name, exposure_s, self._range_s)
         with self._wake:
             self._refuse_when_gone()
             self._n_starts += 1

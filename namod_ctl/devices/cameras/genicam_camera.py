@@ -12,7 +12,7 @@ import threading
 from dataclasses import dataclass
 from typing import NoReturn
 
-from namod_ctl.core.errors import CommunicationError, ConfigError, DeviceFaultError, LimitError
+from namod_ctl.core.errors import CommunicationError, ConfigError, DeviceFaultError
 from namod_ctl.core.interfaces import Exposure, MonotonicClock
 from namod_ctl.devices.cameras.found import FoundCamera
 from namod_ctl.devices.cameras.genicam_aravis import (
@@ -27,7 +27,7 @@ from namod_ctl.devices.cameras.genicam_aravis import (
 from namod_ctl.devices.cameras.genicam_library import AravisError
 from namod_ctl.devices.cameras.genicam_setup import configure
 from namod_ctl.devices.cameras.pixel_formats import image_of
-from namod_ctl.devices.cameras.settings import CameraSettings
+from namod_ctl.devices.cameras.settings import CameraSettings, refuse_outside
 
 LOOK_UP_S = 0.1
 """So often whoever waits for a frame looks whether the camera was closed or lost; a frame wakes it at once."""
@@ -133,11 +133,7 @@ class GenicamCamera:
         """Begin an exposure and return at once; one that runs is given up. See `core.interfaces.Camera`."""
         with self._lock:
             self._check_usable()
-            shortest_s, longest_s = self._exposure_range_s
-            if not shortest_s <= exposure_s <= longest_s:
-                raise LimitError(
-                    f"{self._name}: an exposure of {exposure_s:g} s is not between {shortest_s:g} s and {longest_s:g} s"
-                )
+            refuse_outside(self._name, exposure_s, self._exposure_range_s)
             try:
                 stream = self._stream
                 if stream is None or not self._is_clean:

@@ -15,7 +15,7 @@ from enum import Enum
 from threading import Lock
 from typing import Any, Final
 
-from namod_ctl.core.errors import CommunicationError, DeviceFaultError, LimitError
+from namod_ctl.core.errors import CommunicationError, DeviceFaultError
 from namod_ctl.core.interfaces import Exposure, MonotonicClock
 from namod_ctl.devices.cameras.found import FoundCamera
 from namod_ctl.devices.cameras.indi_client import IndiClient
@@ -30,7 +30,7 @@ from namod_ctl.devices.cameras.indi_setup import (
     set_up,
 )
 from namod_ctl.devices.cameras.server_address import server_address
-from namod_ctl.devices.cameras.settings import CameraSettings
+from namod_ctl.devices.cameras.settings import CameraSettings, refuse_outside
 
 DEFAULT_PORT: Final = 7624
 _DATE_STEP_S: Final = 1e-3  # INDI cuts DATE-OBS to milliseconds
@@ -115,12 +115,7 @@ class IndiCamera:
     def start(self, exposure_s: float) -> None:
         """Begin an exposure; a running one is aborted. Raises LimitError, DeviceFaultError."""
         self._refuse_gone()
-        shortest_s, longest_s = self.exposure_range_s
-        if not shortest_s <= exposure_s <= longest_s:
-            raise LimitError(
-                f"{self.name}: an exposure of {exposure_s:g} s was asked for; "
-                f"it makes {shortest_s:g} to {longest_s:g} s"
-            )
+        refuse_outside(self.name, exposure_s, self.exposure_range_s)
         with self._lock:
             is_busy = self._order is not None and self._order.phase not in (_Phase.DONE, _Phase.FAILED)
             self._order = _Order(exposure_s, _Phase.ABORTING, self._clock.monotonic_s(), datetime.now(UTC))

@@ -16,11 +16,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from namod_ctl.core.errors import CommunicationError, ConfigError, DeviceFaultError, LimitError
+from namod_ctl.core.errors import CommunicationError, ConfigError, DeviceFaultError
 from namod_ctl.core.interfaces import Exposure, MonotonicClock
 from namod_ctl.core.units import s_to_us, us_to_s
 from namod_ctl.devices.cameras.found import FoundCamera
-from namod_ctl.devices.cameras.settings import CameraSettings
+from namod_ctl.devices.cameras.settings import CameraSettings, refuse_outside
 
 VIDEO_DEVICES = Path("/sys/class/video4linux")
 
@@ -105,12 +105,7 @@ class OpencvCamera:
     def start(self, exposure_s: float) -> None:
         """Let the frames count that begin from now on. Raises LimitError, DeviceFaultError."""
         self._refuse_when_gone()
-        shortest_s, longest_s = self._range_s
-        if not shortest_s <= exposure_s <= longest_s:
-            raise LimitError(
-                f"{self._name}: an exposure of {exposure_s:g} s was asked for; it makes {shortest_s:g} to "
-                f"{longest_s:g} s"
-            )
+        refuse_outside(self._name, exposure_s, self._range_s)
         with self._lock:
             self._give_up("the exposure was given up")
             self._n_starts += 1

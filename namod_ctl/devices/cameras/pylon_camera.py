@@ -20,13 +20,13 @@ from typing import Any
 
 import numpy as np
 
-from namod_ctl.core.errors import CommunicationError, ConfigError, DeviceFaultError, LimitError
+from namod_ctl.core.errors import CommunicationError, ConfigError, DeviceFaultError
 from namod_ctl.core.interfaces import Exposure, MonotonicClock
 from namod_ctl.core.units import s_to_ms, s_to_us, us_to_s
 from namod_ctl.devices.cameras.found import FoundCamera
 from namod_ctl.devices.cameras.pixel_formats import Image, choose_format, full_scale_of, image_of
 from namod_ctl.devices.cameras.pylon_nodes import DeviceTimes, PylonNodes
-from namod_ctl.devices.cameras.settings import CameraSettings
+from namod_ctl.devices.cameras.settings import CameraSettings, refuse_outside
 
 READY_S = 0.5
 """A camera takes the next trigger some ms after its frame has come; one that does not within this is busy."""
@@ -128,12 +128,7 @@ class PylonCamera:
         """Begin an exposure; a running one is given up. Raises LimitError, DeviceFaultError."""
         with self._lock:
             self._refuse_lost()
-            shortest_s, longest_s = self.exposure_range_s
-            if not shortest_s <= exposure_s <= longest_s:
-                raise LimitError(
-                    f"{self._name}: an exposure of {exposure_s:g} s was asked for; "
-                    f"it makes {shortest_s:g} to {longest_s:g} s"
-                )
+            refuse_outside(self._name, exposure_s, self.exposure_range_s)
             with self._losing("does not take the next exposure"):
                 if not self._is_idle:
                     self._give_up()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from namod_ctl.core.errors import LimitError
+
 
 @dataclass(frozen=True, slots=True)
 class CameraSettings:
@@ -51,3 +53,12 @@ class CameraSettings:
     offset_px: tuple[int, int] | None = None
     binning: int = 1
     exposure_range_s: tuple[float, float] | None = None
+
+
+def refuse_outside(name: str, exposure_s: float, exposure_range_s: tuple[float, float]) -> None:
+    """Raise LimitError for an exposure that the camera of that name cannot make."""
+    shortest_s, longest_s = exposure_range_s
+    if not shortest_s <= exposure_s <= longest_s:
+        raise LimitError(
+            f"{name}: an exposure of {exposure_s:g} s was asked for; it makes {shortest_s:g} to {longest_s:g} s"
+        )

@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from namod_ctl.core.errors import CommunicationError, ConfigError, DeviceFaultError, LimitError
+from namod_ctl.core.errors import CommunicationError, ConfigError, DeviceFaultError
 from namod_ctl.core.interfaces import Exposure, MonotonicClock
 from namod_ctl.core.units import ms_to_s, s_to_ms
 from namod_ctl.devices.cameras.found import FoundCamera
 from namod_ctl.devices.cameras.pixel_formats import Image, choose_format, full_scale_of, image_of, is_colour
-from namod_ctl.devices.cameras.settings import CameraSettings
+from namod_ctl.devices.cameras.settings import CameraSettings, refuse_outside
 
 WANTED_LONGEST_S = 3.0
 """Exposures of so long are to be possible (arXiv:1605.06274): they are with a slow pixel clock only."""
@@ -92,12 +92,7 @@ class UeyeCamera:
         ueye = self._ueye
         with self._lock:
             self._refuse_lost()
-            shortest_s, longest_s = self.exposure_range_s
-            if not shortest_s <= exposure_s <= longest_s:
-                raise LimitError(
-                    f"{self._name}: an exposure of {exposure_s:g} s was asked for; "
-                    f"it makes {shortest_s:g} to {longest_s:g} s"
-                )
+            refuse_outside(self._name, exposure_s, self.exposure_range_s)
             if not self._is_idle:
                 ueye.is_StopLiveVideo(self._handle, ueye.IS_FORCE_VIDEO_STOP)
             self._is_idle = False
