@@ -11,8 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from namod_ctl.app.alignment_files import alignment_from_json
-from namod_ctl.app.build.instrument import build_instrument
-from namod_ctl.app.build.twin import with_facet_map
+from namod_ctl.app.build.twin import instrument_on_twin
 from namod_ctl.app.config.instrument import InstrumentConfig
 from namod_ctl.app.pictures.figure_style import DPI, ORANGE, SKY, figure_to_png
 from namod_ctl.app.pictures.figures import draw_psf_sum
@@ -43,7 +42,7 @@ def write_campaign_report(path: Path) -> None:
         if not cycles:
             return
         config = InstrumentConfig.from_json(store.config_json, f"{path}: config")
-        instrument = with_facet_map(build_instrument(config))
+        instrument = instrument_on_twin(config)
         files = {
             HISTORY_FILE: figure_to_png(draw_history(cycles, instrument.name)),
             FACETS_FILE: facet_text(cycles).encode(),

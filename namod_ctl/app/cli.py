@@ -3,22 +3,15 @@
 from __future__ import annotations
 
 import sys
-from difflib import get_close_matches
-from importlib import import_module
-from typing import Any, Literal
 
 import typer
-from typer.core import TyperGroup
 
 from namod_ctl import __version__
+from namod_ctl.app.lazy_commands import MARKUP, LazyCommands
 from namod_ctl.app.views.greeting import GREETING
 from namod_ctl.core.errors import NamodError
 
-MARKUP: Literal["markdown"] = (
-    "markdown"  # typer's default swallows what is written in brackets, such as [default: auto]
-)
-
-# A command's module is imported when the command is called, so that none waits for the libraries of another.
+# In the order in which a night needs them.
 _COMMANDS = {
     "config": "namod_ctl.app.commands.config:app",
     "facets": "namod_ctl.app.commands.facets:app",
@@ -33,6 +26,8 @@ _COMMANDS = {
     "instruct": "namod_ctl.app.commands.instruct:instruct",
     "report": "namod_ctl.app.commands.report:report",
     "compare": "namod_ctl.app.commands.compare:compare",
+    "rereduce": "namod_ctl.app.commands.rereduce:rereduce",
+    "calibrate": "namod_ctl.app.commands.calibrate:app",
     "export": "namod_ctl.app.commands.export:export",
     "raytrace": "namod_ctl.app.commands.raytrace:raytrace",
     "status": "namod_ctl.app.commands.status:status",
@@ -46,34 +41,8 @@ _COMMANDS = {
 }
 
 
-class _Commands(TyperGroup):
-    """The commands in the order in which a night needs them, imported on demand."""
-
-    # typer brings its own copy of click or the real one, depending on its version: hence Any
-    def list_commands(self, ctx: Any) -> list[str]:
-        return list(_COMMANDS)
-
-    def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        if cmd_name not in _COMMANDS:
-            return None
-        module, name = _COMMANDS[cmd_name].split(":")
-        target = getattr(import_module(module), name)
-        if not isinstance(target, typer.Typer):
-            function, target = (
-                target,
-                typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=MARKUP),
-            )
-            target.command(cmd_name)(function)
-        command = typer.main.get_command(target)
-        command.name = cmd_name
-        return command
-
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        if args and args[0] not in _COMMANDS and not args[0].startswith("-"):
-            near = get_close_matches(args[0], _COMMANDS)
-            hint = f"Did you mean {' or '.join(map(repr, near))}?" if near else "namod-ctl --help lists all commands."
-            ctx.fail(f"No such command {args[0]!r}. {hint}")
-        return super().resolve_command(ctx, args)
+class _Commands(LazyCommands):
+    commands_of_group = _COMMANDS
 
 
 app = typer.Typer(

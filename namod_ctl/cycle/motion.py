@@ -15,7 +15,8 @@ from namod_ctl.core.flags import RejectReason
 from namod_ctl.core.records import Record
 from namod_ctl.core.units import rad_to_deg
 from namod_ctl.cycle.pairs import Pair
-from namod_ctl.imaging.radiometry import checked_frame, grey_frame, saturation_adu
+from namod_ctl.imaging.measure import without_dark
+from namod_ctl.imaging.radiometry import grey_frame, saturation_adu
 from namod_ctl.imaging.star import Star, star_finder
 from namod_ctl.optics.instrument import Instrument
 
@@ -50,7 +51,7 @@ def speed_from_look(pair: Pair, record: Record, instrument: Instrument) -> float
     if pair.look is None:
         return math.nan
     camera = instrument.star_camera
-    grey = grey_frame(checked_frame(pair.look.image, camera), saturation_adu(camera))
+    grey = grey_frame(without_dark(pair.look.image, camera, pair.look.exposure_s), saturation_adu(camera))
     star = star_finder(camera, instrument.star_size_rad, grey.dtype).find(grey)
     if not isinstance(star, Star):
         return math.nan

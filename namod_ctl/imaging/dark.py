@@ -1,11 +1,13 @@
 """Dark frames and hot pixels: what a camera shows without light, and how it is taken out of a frame.
 
-Dark frames belong to an exposure; whoever takes them keeps them apart. Nothing here changes its input.
+Dark frames belong to an exposure; a camera's dark model, from its calibration, holds for every exposure. Nothing here
+changes its input.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -13,6 +15,7 @@ from numpy.typing import NDArray
 
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.imaging.radiometry import Frame
+from namod_ctl.optics.camera_model import DarkModel
 
 HOT_SIGMAS = 8.0
 """A pixel is hot when it stands so many standard deviations above its neighbourhood: one in 1e15 by chance."""
@@ -94,9 +97,32 @@ def subtract_dark(frame: Frame, dark: Dark, saturation_adu: float) -> Frame:
             f"{frame.shape} and type {frame.dtype}: give the dark frames of the same camera and mode"
         )
     subtracted: Frame = cv2.subtract(frame, dark.level)
-    is_saturated = frame >= saturation_adu
-    subtracted[is_saturated] = frame[is_saturated]
+    np.copyto(subtracted, frame, where=frame >= saturation_adu)
     return repair_pixels(subtracted, dark.is_hot)
+
+
+def subtract_dark_model(frame: Frame, dark: DarkModel, exposure_s: float, saturation_adu: float) -> Frame:
+    """What `subtract_dark` makes of a frame, by the camera's dark model instead of dark frames.
+
+    The level is rounded to whole numbers, as the frame is. Hot pixels are of the whole image, in all channels.
+    """
+    level = round(dark.level_adu(exposure_s))
+    if level > 0:
+        subtracted: Frame = cv2.subtract(frame, np.full_like(frame, level))
+        np.copyto(subtracted, frame, where=frame >= saturation_adu)
+        frame = subtracted
+    if not len(dark.hot_pixels):
+        return frame
+    is_hot, positions = _hot_in_frame(dark, frame.shape)
+    return _repaired(frame, is_hot, positions)
+
+
+@lru_cache(maxsize=8)
+def _hot_in_frame(dark: DarkModel, shape: tuple[int, ...]) -> tuple[NDArray[np.bool_], tuple[NDArray[np.intp], ...]]:
+    """The model's hot pixels as a mask of a frame's shape, and where it is true."""
+    is_hot = np.zeros(shape, dtype=bool)
+    is_hot[dark.hot_pixels[:, 1], dark.hot_pixels[:, 0]] = True
+    return is_hot, np.nonzero(is_hot)
 
 
 def repair_pixels(frame: Frame, is_bad: NDArray[np.bool_]) -> Frame:
@@ -105,8 +131,11 @@ def repair_pixels(frame: Frame, is_bad: NDArray[np.bool_]) -> Frame:
     `is_bad` has the frame's shape; channels of a colour frame are repaired apart. A bad pixel without any good
     neighbour gets the frame's median.
     """
+    return _repaired(frame, is_bad, np.nonzero(is_bad))
+
+
+def _repaired(frame: Frame, is_bad: NDArray[np.bool_], bad: tuple[NDArray[np.intp], ...]) -> Frame:
     repaired = frame.copy()
-    bad = np.nonzero(is_bad)
     if bad[0].size == 0:
         return repaired
     pending = np.ones(bad[0].size, dtype=bool)

@@ -6,7 +6,7 @@ import numpy as np
 
 from namod_ctl.core.flags import RejectReason
 from namod_ctl.core.records import Record
-from namod_ctl.imaging.dark import Dark, subtract_dark
+from namod_ctl.imaging.dark import Dark, subtract_dark, subtract_dark_model
 from namod_ctl.imaging.facets import FacetLight, FacetPhotometer
 from namod_ctl.imaging.radiometry import Frame, checked_frame, exposure_factor, grey_frame, saturation_adu
 from namod_ctl.imaging.star import Star, StarRejection, star_finder
@@ -40,7 +40,8 @@ def measure_record(
     photometer
         Of the facets to measure; its order is that of the record's facets.
     star_dark, reflector_dark
-        What the cameras show without light at these exposures, taken off first.
+        What the cameras show without light at these exposures, taken off first; without them the dark models of the
+        cameras' calibrations, where there are any, serve.
 
     Returns
     -------
@@ -55,7 +56,9 @@ def measure_record(
     """
     star = _star(star_frame, star_exposure_s, instrument, star_dark)
     camera = instrument.reflector_camera
-    light = photometer.measure(_without_dark(reflector_frame, camera, reflector_dark), camera, reflector_exposure_s)
+    light = photometer.measure(
+        without_dark(reflector_frame, camera, reflector_exposure_s, reflector_dark), camera, reflector_exposure_s
+    )
     saturated = _saturated_facets(light, photometer)
     reason: RejectReason | None = None
     detail = ""
@@ -86,13 +89,18 @@ def measure_record(
 def _star(frame: Frame, exposure_s: float, instrument: Instrument, dark: Dark | None) -> Star | StarRejection:
     camera = instrument.star_camera
     exposure_factor(camera.law, exposure_s)
-    grey = grey_frame(_without_dark(frame, camera, dark), saturation_adu(camera))
+    grey = grey_frame(without_dark(frame, camera, exposure_s, dark), saturation_adu(camera))
     return star_finder(camera, instrument.star_size_rad, grey.dtype).find(grey)
 
 
-def _without_dark(frame: Frame, camera: CameraModel, dark: Dark | None) -> Frame:
+def without_dark(frame: Frame, camera: CameraModel, exposure_s: float, dark: Dark | None = None) -> Frame:
+    """The frame, checked, less what the camera shows without light, as far as that is known."""
     frame = checked_frame(frame, camera)
-    return frame if dark is None else subtract_dark(frame, dark, saturation_adu(camera))
+    if dark is not None:
+        return subtract_dark(frame, dark, saturation_adu(camera))
+    if camera.dark is not None:
+        return subtract_dark_model(frame, camera.dark, exposure_s, saturation_adu(camera))
+    return frame
 
 
 def _saturated_facets(light: FacetLight, photometer: FacetPhotometer) -> str:

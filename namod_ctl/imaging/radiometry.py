@@ -1,8 +1,9 @@
 """From camera responses to relative intensities: the radiometric law of a camera.
 
 ``log10(I) = r_resp * log10(C) + r_expo * log10(T) + r_const`` (arXiv:1605.06274, section 3), with C the pixel's
-response as a share of full scale and T the exposure in s. A camera knows a few hundred or thousand responses only, so
-the part that depends on C is a table over all of them, and the rest one factor of a frame.
+response as a share of full scale and T the exposure in s; a camera may have a further r_curve * log10(C)**2. A camera
+knows a few hundred or thousand responses only, so the part that depends on C is a table over all of them, and the rest
+one factor of a frame.
 
 What a pixel's response is in a colour frame: every channel goes through the law by itself, and the pixel's intensity
 is the mean of its three channels' intensities. A frame whose three channels are copies of one grey frame (the files
@@ -79,19 +80,19 @@ def saturation_adu(camera: CameraModel) -> float:
 
 
 def response_table(camera: CameraModel, dtype: np.dtype[Any]) -> Array:
-    """C**r_resp for every response a frame of that type can hold, shape (256,) or (65536,), read-only.
+    """C**(r_resp + r_curve log10 C) for every response a frame of that type can hold, (256,) or (65536,), read-only.
 
     Multiply by `exposure_factor` for intensities. No response is no intensity. Responses above full scale count as
     full scale: there the law has no meaning, and they are saturated anyway.
     """
-    return _response_table(camera.law.r_resp, camera.full_scale_adu, int(np.iinfo(dtype).max) + 1)
+    return _response_table(camera.law.r_resp, camera.law.r_curve, camera.full_scale_adu, int(np.iinfo(dtype).max) + 1)
 
 
 @lru_cache(maxsize=16)
-def _response_table(r_resp: float, full_scale_adu: float, n_levels: int) -> Array:
-    share = np.minimum(np.arange(n_levels) / full_scale_adu, 1.0)
+def _response_table(r_resp: float, r_curve: float, full_scale_adu: float, n_levels: int) -> Array:
+    share = np.minimum(np.arange(1, n_levels) / full_scale_adu, 1.0)
     table = np.zeros(n_levels)
-    np.power(share, r_resp, out=table, where=share > 0.0)
+    table[1:] = share ** (r_resp if r_curve == 0.0 else r_resp + r_curve * np.log10(share))
     table.setflags(write=False)
     return table
 

@@ -13,7 +13,8 @@ from pydantic import TypeAdapter, ValidationError
 
 from namod_ctl.app.build.instrument import build_instrument
 from namod_ctl.app.build.twin_limits import Origins, as_written, beyond_limits, in_radians
-from namod_ctl.app.config.instrument import InstrumentConfig
+from namod_ctl.app.config.instrument import CAMERA_SECTIONS, InstrumentConfig
+from namod_ctl.app.config.schema import DeviceCameraSection
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.optics.camera_model import CameraModel
 from namod_ctl.optics.instrument import Instrument
@@ -81,14 +82,32 @@ def _fault_problems(settings: TwinSettings) -> Iterator[str]:
 def build_twin(config: InstrumentConfig, settings: TwinSettings, seed: int, wiring: Sequence[BusWiring] = ()) -> Twin:
     """The twin of that config; `twin.instrument` has a map of facets even where the config has none.
 
-    With `wiring` (`build_twin_actuators.twin_wiring`) its facets have drives.
+    Its cameras are those of the config without calibrations: what a calibration tells of a camera does not change it.
+    The program sees `instrument_on_twin`. With `wiring` (`build_twin_actuators.twin_wiring`) its facets have drives.
 
     Raises
     ------
     ConfigError
         For a star, a fault or a parameter in the settings that does not exist.
     """
-    return Twin(with_facet_map(build_instrument(config)), settings, seed, wiring)
+    return Twin(with_facet_map(build_instrument(_uncalibrated(config))), settings, seed, wiring)
+
+
+def instrument_on_twin(config: InstrumentConfig) -> Instrument:
+    """The instrument as the program knows it, on a twin of that config: by the cameras' calibrations, if it has any."""
+    instrument = build_instrument(config)
+    if instrument.facet_polygons_px:
+        return instrument
+    polygons_px = with_facet_map(build_instrument(_uncalibrated(config))).facet_polygons_px
+    return replace(instrument, facet_polygons_px=polygons_px)
+
+
+def _uncalibrated(config: InstrumentConfig) -> InstrumentConfig:
+    cameras: dict[str, DeviceCameraSection | None] = {role: getattr(config, role) for role in CAMERA_SECTIONS}
+    bare = {
+        role: camera.model_copy(update={"calibrations": None}) for role, camera in cameras.items() if camera is not None
+    }
+    return config.model_copy(update=bare)
 
 
 def with_facet_map(instrument: Instrument) -> Instrument:

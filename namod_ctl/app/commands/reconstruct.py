@@ -37,6 +37,7 @@ from namod_ctl.store.results import write_results
 from namod_ctl.store.run import RunStore
 
 _INSTRUCTIONS = CSV_FILE, PNG_FILE, PDF_FILE
+DEFAULT_BIN_SIZE_DEG = 0.01
 _MIN_BIN_DEG, _MAX_BIN_DEG = 0.0005, 1.0
 
 
@@ -51,7 +52,7 @@ def reconstruct_run(
     ] = DEFAULT_ESTIMATOR,
     bin_size_deg: Annotated[
         float, typer.Option("--bin-size-deg", help="Size of the bins of the histograms.", show_default=True)
-    ] = 0.01,
+    ] = DEFAULT_BIN_SIZE_DEG,
     halves: Annotated[
         bool, typer.Option("--halves", help="Also reconstruct even and odd records separately and compare them.")
     ] = False,
@@ -91,7 +92,7 @@ def reconstruct_run(
             with console.status(f"combining {len(runs)} runs"):
                 folder = stack.enter_context(combined_run(runs, out, clock, force=force))
         had_instructions = any((run / name).exists() for name in _INSTRUCTIONS)
-        report = _reconstruct_in(folder, estimator, deg_to_rad(bin_size_deg), clock, console, halves=halves)
+        report = reconstruct_in(folder, estimator, deg_to_rad(bin_size_deg), clock, console, halves=halves)
     console.print(report, soft_wrap=True, markup=False)
     console.print(
         f"Written to {run}: {ALIGNMENT_FILE}, {REPORT_FILE}, tables and pictures. Next: namod-ctl instruct {run}",
@@ -107,7 +108,7 @@ def reconstruct_run(
         )
 
 
-def _reconstruct_in(
+def reconstruct_in(
     run: Path, estimator: str, bin_size_rad: float, clock: Clock, console: Console, *, halves: bool
 ) -> str:
     """The report of the run's reconstruction; it and all other results are in the run's folder then."""

@@ -17,16 +17,15 @@ import typer
 from rich.console import Console
 
 from namod_ctl.app.build.bench_sky import twin_equipment
-from namod_ctl.app.build.instrument import build_instrument
 from namod_ctl.app.build.recording import build_record_settings
+from namod_ctl.app.build.replay import new_run_of, replay_equipment
 from namod_ctl.app.build.sky_session import open_sky_session
-from namod_ctl.app.build.twin import build_twin, load_twin_settings, with_facet_map
+from namod_ctl.app.build.twin import build_twin, instrument_on_twin, load_twin_settings
 from namod_ctl.app.build.twin_note import different_sections, note_twin, noted_twin
 from namod_ctl.app.config.instrument import InstrumentConfig, load_config
 from namod_ctl.app.dashboard.beside import dashboard_beside
 from namod_ctl.app.views.number_ranges import counted
 from namod_ctl.app.views.recording_view import TerminalView
-from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.flags import REJECT_REASON_MEANING
 from namod_ctl.core.records import Record
@@ -35,9 +34,9 @@ from namod_ctl.cycle.live_estimate import LiveEstimator
 from namod_ctl.cycle.progress import Progress
 from namod_ctl.cycle.record import SESSION_GAP_S, Equipment, Recorder, StopRule
 from namod_ctl.cycle.recording_control import RecordingControl
-from namod_ctl.cycle.replay import CAMERAS, ReplayCamera, ReplayClock, replayable_records
+from namod_ctl.cycle.replay import replayable_records
 from namod_ctl.optics.instrument import Instrument
-from namod_ctl.store.folders import check_output, discard, free_sibling, is_run, put_in_place
+from namod_ctl.store.folders import is_run
 from namod_ctl.store.import_namod import KeepFrames
 from namod_ctl.store.run import RunStore
 from namod_ctl.store.run_lock import recording_lock
@@ -276,40 +275,23 @@ def _record_twin(
         stack.enter_context(recording_lock(store.path))
         note_twin(store, settings, chosen)
     equipment = stack.enter_context(twin_equipment(used, twin))()
-    return _Session(equipment, twin.instrument, used, store, store.path, twin.telescope.pass_s)
+    return _Session(equipment, instrument_on_twin(used), used, store, store.path, twin.telescope.pass_s)
 
 
 def _replay(stack: ExitStack, replay: Path, out: Path | None, console: Console, *, force: bool) -> _Session:
     if out is None:
         raise ConfigError("--replay RUN needs --out for the new run: the old one stays as it is")
-    if out.resolve() == replay.resolve():
-        raise ConfigError(f"--out {out}: is the run that is replayed, which stays as it is; choose another")
-    with RunStore.open(replay) as old:
-        found = replayable_records(old)
-        n_without = len(old.labels()) - len(found)
-        if n_without:
-            text = f"{replay}: {n_without} of its records without frames left out"
-            console.print(text, markup=False, soft_wrap=True)
-        star, reflector = (ReplayCamera(old, found, camera) for camera in CAMERAS)
-        config = InstrumentConfig.from_json(old.config_json, f"{replay}: config")
-        instrument = with_facet_map(build_instrument(config))
-    store = stack.enter_context(_put_at(out.resolve(), old, force=force))
-    equipment = Equipment(star, reflector, ReplayClock(), SystemClock())
-    return _Session(equipment, instrument, config, store, out.resolve(), 0.0, iter(found))
-
-
-@contextmanager
-def _put_at(out: Path, old: RunStore, *, force: bool) -> Iterator[RunStore]:
-    """A run that is put at `out` when the block is done: a replay that fails leaves nothing and replaces nothing."""
-    check_output(out, force=force)
-    built = free_sibling(out)
-    try:
-        with RunStore.create(built, old.facet_ids, old.config_json, f"replay of {old.path}", SystemClock()) as store:
-            yield store
-        put_in_place(built, out, force=force)
-    except BaseException:
-        discard(built)
-        raise
+    old = stack.enter_context(RunStore.open(replay))
+    found = replayable_records(old)
+    n_without = len(old.labels()) - len(found)
+    if n_without:
+        text = f"{replay}: {n_without} of its records without frames left out"
+        console.print(text, markup=False, soft_wrap=True)
+    config = InstrumentConfig.from_json(old.config_json, f"{replay}: config")
+    run = new_run_of(old, out, old.config_json, f"replay of {old.path}", force=force)
+    store = stack.enter_context(run)
+    equipment = replay_equipment(old, found)
+    return _Session(equipment, instrument_on_twin(config), config, store, out.resolve(), 0.0, iter(found))
 
 
 @contextmanager

@@ -8,7 +8,7 @@ import numpy as np
 
 from namod_ctl.app.config.actuator_problems import actuator_problems
 from namod_ctl.app.config.camera_problems import camera_problems
-from namod_ctl.app.config.parts import mount_of, reflector_of
+from namod_ctl.app.config.parts import camera_of, mount_of, reflector_of
 from namod_ctl.app.config.schema import FacetSection, InstrumentSections
 from namod_ctl.app.views.number_ranges import runs_in_words
 from namod_ctl.core.errors import ConfigError
@@ -141,9 +141,9 @@ def _bad_target(config: InstrumentSections, source: str) -> list[str]:
     cameras = (("star_camera", config.star_camera), ("reflector_camera", config.reflector_camera))
     return [
         f"{source}: recording.brightest_pixel_share = {share:g} must be less than {name}.saturation_share = "
-        f"{camera.saturation_share:g}: every frame would be saturated"
+        f"{saturation_share:g}: every frame would be saturated"
         for name, camera in cameras
-        if share >= camera.saturation_share
+        if share >= (saturation_share := camera_of(camera).saturation_share)
     ]
 
 

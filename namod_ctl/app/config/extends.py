@@ -78,8 +78,13 @@ def _name_files_from(raw: dict[str, Any], folder: Path) -> None:
     buses = actuators.get("buses") if isinstance(actuators, dict) else None
     tables = [(raw.get("reflector"), "facets_file"), (raw.get("reflector_map"), "polygons_file")]
     tables += [(bus, "drive_map") for bus in (buses if isinstance(buses, list) else [])]
-    for camera in ("star_camera", "reflector_camera"):
-        device = raw[camera].get("device") if isinstance(raw.get(camera), dict) else None
+    for camera in ("star_camera", "reflector_camera", "psf_camera"):
+        section = raw.get(camera)
+        if not isinstance(section, dict):
+            continue
+        device, files = section.get("device"), section.get("calibrations")
+        if isinstance(files, list):
+            section["calibrations"] = [str(folder / name) if isinstance(name, str) else name for name in files]
         if isinstance(device, dict) and device.get("driver") == "folder" and isinstance(device.get("address"), str):
             device["address"] = str(folder / Path(device["address"]).expanduser())  # may come into being later
     for table, key in tables:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from datetime import datetime
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -11,6 +12,8 @@ from pydantic import TypeAdapter, ValidationError
 
 import namod_ctl
 from namod_ctl.app.config.actuator_schema import ActuatorsSection
+from namod_ctl.app.config.calibration_schema import CameraRole
+from namod_ctl.app.config.calibrations import calibration_problems, with_calibrations_read
 from namod_ctl.app.config.camera_problems import with_whole_folder
 from namod_ctl.app.config.contradictions import contradictions
 from namod_ctl.app.config.extends import read_extended
@@ -24,6 +27,7 @@ from namod_ctl.app.config.schema import (
     ReflectorSection,
 )
 from namod_ctl.app.config.section import Section
+from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.units import rad_to_deg
 from namod_ctl.devices.drive_maps import read_drive_map
@@ -32,6 +36,7 @@ from namod_ctl.optics.reflector import Facet, FacetShape
 from namod_ctl.store.facet_lists import read_mars, read_sim_telarray
 from namod_ctl.store.facet_tables import read_facet_table, read_polygon_table
 
+CAMERA_SECTIONS: tuple[CameraRole, ...] = ("star_camera", "reflector_camera")
 MAX_REPORTED_PROBLEMS = 40  # a wrong unit in a list of 1000 facets needs no 1000 lines
 SAME_ANGLE_DECIMALS = 12  # of a degree: takes the rounding of deg -> rad -> deg away
 
@@ -73,6 +78,9 @@ class InstrumentConfig(InstrumentSections):
         buses = config.actuators.buses if config.actuators is not None else ()
         if any(isinstance(bus.drive_map, str) for bus in buses):
             raise ConfigError(f"{source}: actuators: the stored config must hold its register maps written out")
+        for name in CAMERA_SECTIONS:
+            if any(isinstance(named, str) for named in getattr(config, name).calibrations or ()):
+                raise ConfigError(f"{source}: {name}: the stored config must hold its calibrations written out")
         _raise_together(contradictions(config, cls.model_fields.keys(), source))
         return config
 
@@ -102,10 +110,11 @@ def find_config(name_or_path: str | Path) -> Path:
     )
 
 
-def load_config(name_or_path: str | Path, *, has_map: bool = True) -> InstrumentConfig:
+def load_config(name_or_path: str | Path, *, has_map: bool = True, now: datetime | None = None) -> InstrumentConfig:
     """The config of a built-in name or a TOML file, with the files it names read and everything checked.
 
     Without `has_map` the map of facets is left out, as if the config had none: for those who are about to make it.
+    Calibrations must be valid at `now`, by default that of the computer's clock.
 
     Raises
     ------
@@ -132,10 +141,24 @@ def load_config(name_or_path: str | Path, *, has_map: bool = True) -> Instrument
         except ConfigError as problem:
             problems.append(str(problem))
             known.discard(name)
-    for name in sorted(known & {"star_camera", "reflector_camera"}):
-        written_out[name] = with_whole_folder(getattr(config, name), path.parent)
+    for name in CAMERA_SECTIONS:
+        if name in known and getattr(config, name) is not None:
+            camera = with_whole_folder(getattr(config, name), path.parent)
+            try:
+                camera = with_calibrations_read(camera, path.parent)
+            except ConfigError as problem:
+                problems.append(f"{source}: {name}.calibrations: {problem}")
+            written_out[name] = camera
     config = config.model_copy(update=written_out)
-    _raise_together(problems + contradictions(config, known, source))
+    problems += contradictions(config, known, source)
+    moment = now or SystemClock().now()
+    problems += [
+        f"{source}: {name}.calibrations: {problem}"
+        for name in CAMERA_SECTIONS
+        if name in known and getattr(config, name) is not None
+        for problem in calibration_problems(getattr(config, name), name, moment)
+    ]
+    _raise_together(problems)
     return config
 
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from namod_ctl.app.config.calibrations import calibrated, calibrations_of
 from namod_ctl.app.config.schema import (
     FacetSection,
     LegsMountSection,
@@ -64,10 +65,13 @@ def mount_of(section: TripodMountSection | LegsMountSection, orientation_deg: fl
 
 
 def camera_of(section: StarCameraSection | ReflectorCameraSection) -> CameraModel:
-    """One camera; without a calibrated axis its nominal centre, half its width and height, stands for it."""
+    """One camera, by its calibrations where it has any.
+
+    Without a calibrated axis its nominal centre, half its width and height, stands for it.
+    """
     axis_px = (section.columns / 2.0, section.rows / 2.0) if section.axis_px is None else section.axis_px
     law = section.radiometric_law
-    return CameraModel(
+    camera = CameraModel(
         name=section.model,
         n_columns=section.columns,
         n_rows=section.rows,
@@ -79,3 +83,4 @@ def camera_of(section: StarCameraSection | ReflectorCameraSection) -> CameraMode
         full_scale_adu=section.full_scale_adu,
         saturation_share=section.saturation_share,
     )
+    return calibrated(camera, calibrations_of(section))

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from namod_ctl.app.config.actuator_schema import ActuatorsSection
+from namod_ctl.app.config.calibration_schema import Calibration
 from namod_ctl.app.config.camera_schema import DeviceSection
 from namod_ctl.app.config.section import FacetId, FileName, Name, Section, within
 
@@ -158,20 +159,34 @@ class RadiometricLawSection(Section):
     r_const: Annotated[float, within(-10.0, 10.0)]
 
 
-class _CameraSection(Section):
-    """What both cameras have."""
+AcceptedCalibration = Literal["expired", "foreign"]
+
+
+class DeviceCameraSection(Section):
+    """What any camera has.
+
+    `calibrations` are files, or written out; what they hold takes the place of what stands here.
+    `accept_calibrations` lets those pass that are expired, or foreign: of another camera by their serial number.
+    """
 
     model: Name
     serial_number: Name | None = None
     columns: Annotated[int, within(64, 20_000)]
     rows: Annotated[int, within(64, 20_000)]
+    full_scale_adu: Annotated[float, within(1.0, 65_535.0)]
+    saturation_share: Annotated[float, within(0.5, 1.0)]
+    device: DeviceSection | None = None
+    calibrations: Annotated[tuple[FileName | Calibration, ...] | None, Field(strict=False)] = None
+    accept_calibrations: Annotated[tuple[AcceptedCalibration, ...] | None, Field(strict=False)] = None
+
+
+class _CameraSection(DeviceCameraSection):
+    """What both cameras of the method have."""
+
     rotation_deg: AngleDeg
     mirrored: bool
     axis_px: PixelXY | None = None
-    full_scale_adu: Annotated[float, within(1.0, 65_535.0)]
-    saturation_share: Annotated[float, within(0.5, 1.0)]
     radiometric_law: RadiometricLawSection
-    device: DeviceSection | None = None
 
     @model_validator(mode="after")
     def _axis_is_in_image(self) -> _CameraSection:
@@ -241,10 +256,19 @@ class RecordingSection(Section):
         return self
 
 
+class SiteSection(Section):
+    """Where the telescope stands; longitude is positive to the east."""
+
+    latitude_deg: Annotated[float, within(-90.0, 90.0)]
+    longitude_deg: Annotated[float, within(-180.0, 360.0)]
+    altitude_m: Annotated[float, within(-500.0, 9000.0)]
+
+
 class InstrumentSections(Section):
     """The whole file."""
 
     telescope: TelescopeSection
+    site: SiteSection | None = None
     reflector: ReflectorSection
     mount: MountSection
     star_camera: StarCameraSection

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from namod_ctl.app.config.actuator_summary import actuator_rows, actuator_warnings
+from namod_ctl.app.config.calibrations import calibrations_of
 from namod_ctl.app.config.instrument import InstrumentConfig
 from namod_ctl.app.config.schema import LegsMountSection, ReflectorCameraSection, StarCameraSection, TripodMountSection
 from namod_ctl.app.views.number_ranges import runs_in_words
-from namod_ctl.core.units import m2_to_cm2, rad_to_deg
+from namod_ctl.core.units import m2_to_cm2, rad_to_deg, rad_to_mdeg
 from namod_ctl.optics.camera_model import CameraModel
 from namod_ctl.optics.instrument import Instrument
 from namod_ctl.optics.layouts import facet_area_m2, facet_outline_m
@@ -128,18 +129,23 @@ def _legs_in_words(section: LegsMountSection) -> str:
 def _camera_rows(
     section: StarCameraSection | ReflectorCameraSection, camera: CameraModel
 ) -> tuple[tuple[str, str], ...]:
-    law = section.radiometric_law
+    law = camera.law
+    curve = f" {law.r_curve:+g} (log10 C)^2" if law.r_curve else ""
     width_deg, height_deg = _view_deg(camera)
     serial = f", serial number {section.serial_number}" if section.serial_number is not None else ""
     rows = [
         ("model", f"{section.model}{serial}"),
         ("device", _device_in_words(section)),
         ("image", f"{section.columns} x {section.rows} px, full scale {section.full_scale_adu:g} adu"),
-        ("saturated from", f"{section.saturation_share:.0%} of full scale"),
-        ("plate scale", f"{section.plate_scale_mdeg_per_px:g} mdeg per px"),
+        ("saturated from", f"{camera.saturation_share:.0%} of full scale"),
+        ("plate scale", f"{rad_to_mdeg(camera.plate_scale_rad):.6g} mdeg per px"),
         ("field of view", f"{width_deg:.2f} x {height_deg:.2f} deg"),
         ("orientation", _orientation_in_words(camera)),
-        ("radiometric law", f"log10 I = {law.r_resp:g} log10 C {law.r_expo:+g} log10 (T/s) {law.r_const:+g}"),
+        ("radiometric law", f"log10 I = {law.r_resp:g} log10 C{curve} {law.r_expo:+g} log10 (T/s) {law.r_const:+g}"),
+    ]
+    rows += [
+        ("calibration", f"{calibration.kind}, of {calibration.made_utc}, valid until {calibration.valid_until_utc}")
+        for calibration in calibrations_of(section)
     ]
     if isinstance(section, StarCameraSection):
         x_px, y_px = camera.axis_pixel

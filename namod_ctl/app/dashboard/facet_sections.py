@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from namod_ctl.app.build.instrument import build_instrument
-from namod_ctl.app.build.twin import with_facet_map
+from namod_ctl.app.build.twin import instrument_on_twin
 from namod_ctl.app.config.instrument import InstrumentConfig
 from namod_ctl.app.dashboard.numbers import short, shorts
 from namod_ctl.core.flags import FACET_FLAG_MEANING
@@ -29,7 +28,7 @@ _REACH_SIGMAS = 3.0
 
 def instrument_of(config: InstrumentConfig) -> Instrument:
     """The instrument, with outlines of its facets in the picture even where nobody has drawn any."""
-    return with_facet_map(build_instrument(config))
+    return instrument_on_twin(config)
 
 
 def geometry(instrument: Instrument) -> dict[str, Any]:

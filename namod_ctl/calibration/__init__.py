@@ -1,0 +1,1 @@
+"""Calibrations of cameras, optics and structure: pure estimators."""
