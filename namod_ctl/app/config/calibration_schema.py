@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from namod_ctl.app.config.section import Name, Section, within
+from namod_ctl.core.units import mdeg_to_rad
 
 SCHEMA = "namod-calibration/1"
 CameraRole = Literal["star_camera", "reflector_camera", "psf_camera"]
@@ -138,6 +139,17 @@ class GeometryCalibration(_Calibration):
     residual_rms_px: Positive
     method: Name
     n_points: Annotated[int, Field(ge=1)]
+
+    @model_validator(mode="after")
+    def _has_one_direction_per_pixel(self) -> GeometryCalibration:
+        bend = self.distortion
+        if bend is None:
+            return self
+        x, y = (max(at, size - at) for at, size in zip(bend.centre_px, (self.columns, self.rows), strict=True))
+        angle2 = (mdeg_to_rad(self.plate_scale_mdeg_per_px) ** 2) * (x**2 + y**2)
+        if min(1.0 + a2 * (3.0 * bend.k1_per_rad2 + 5.0 * bend.k2_per_rad4 * a2) for a2 in (angle2, angle2 / 2.0)) <= 0:
+            raise ValueError("distortion folds the image onto itself before its corner: k1 and k2 cannot be right")
+        return self
 
 
 ZenithRow = Annotated[tuple[Annotated[float, within(0.0, 90.0)], float, float], Field(strict=False)]
