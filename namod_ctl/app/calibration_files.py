@@ -9,7 +9,7 @@ from typing import Any, Literal
 from namod_ctl import __version__
 from namod_ctl.app.config.calibration_schema import Calibration, CameraRole
 from namod_ctl.app.config.calibrations import TWIN_NUMBER, calibration_to_json
-from namod_ctl.app.config.schema import DeviceCameraSection
+from namod_ctl.app.config.camera_schema import DeviceCameraSection
 from namod_ctl.core.clock import Clock
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.store.frames import write_file_durably
@@ -83,6 +83,10 @@ def write_calibration(path: Path, calibration: Calibration, *, force: bool = Fal
     write_file_durably(path, calibration_to_json(calibration).encode())
 
 
-def how_to_use(path: Path, role: CameraRole) -> str:
+def how_to_use(path: Path, calibration: Calibration) -> str:
     """What the person does next with a new calibration file."""
-    return f'To use it, add to [{role}] of the config:  calibrations = ["{path}"]'
+    text = f'To use it, add to [{calibration.camera}] of the config:  calibrations = ["{path}"]'
+    if calibration.serial_number is not None and calibration.serial_number.startswith(TWIN_NUMBER):
+        text += "\nIt is of the twin, so it passes for no real camera; to rehearse with it, add there as well:"
+        text += '  accept_calibrations = ["foreign"]'
+    return text

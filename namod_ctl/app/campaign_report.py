@@ -13,7 +13,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from namod_ctl.app.alignment_files import alignment_from_json
 from namod_ctl.app.build.twin import instrument_on_twin
 from namod_ctl.app.config.instrument import InstrumentConfig
-from namod_ctl.app.pictures.figure_style import DPI, ORANGE, SKY, figure_to_png
+from namod_ctl.app.pictures.figure_style import DPI, ORANGE, SKY, VERMILLION, figure_to_png
 from namod_ctl.app.pictures.figures import draw_psf_sum
 from namod_ctl.app.pictures.psf_panels import measured_panels
 from namod_ctl.app.report.journal import journal_rows
@@ -21,16 +21,19 @@ from namod_ctl.app.report.parts import area_text, when_text
 from namod_ctl.app.views.number_ranges import counted
 from namod_ctl.core.units import rad2_to_arcmin2, rad_to_arcmin
 from namod_ctl.cycle.machine import STATES
+from namod_ctl.cycle.psf_check import EVENT as PSF_CHECK
 from namod_ctl.optics.instrument import Instrument
 from namod_ctl.reconstruction.alignment import AreaOfPsf
 from namod_ctl.reconstruction.reconstruct import reconstruct
 from namod_ctl.reconstruction.responses import tabulate_responses
 from namod_ctl.store.campaign import CampaignStore
-from namod_ctl.store.campaign_rows import Cycle
+from namod_ctl.store.campaign_rows import Cycle, Event
 from namod_ctl.store.results import write_results
 from namod_ctl.store.run import RunStore
 
 REPORT_FOLDER = "report"
+BESIDE = 0.07
+"""Of a cycle: so far from its estimate another one of the same moment is drawn."""
 HISTORY_FILE, FACETS_FILE, SUMMARY_FILE = "a_sigma_history.png", "facets.csv", "summary.txt"
 PSF_FILE = "psf_before_and_after.png"
 
@@ -44,7 +47,7 @@ def write_campaign_report(path: Path) -> None:
         config = InstrumentConfig.from_json(store.config_json, f"{path}: config")
         instrument = instrument_on_twin(config)
         files = {
-            HISTORY_FILE: figure_to_png(draw_history(cycles, instrument.name)),
+            HISTORY_FILE: figure_to_png(draw_history(cycles, instrument.name, store.events())),
             FACETS_FILE: facet_text(cycles).encode(),
             SUMMARY_FILE: summary_text(store).encode(),
             PSF_FILE: _psf_picture(store, cycles[:1] + cycles[-1:] if len(cycles) > 1 else cycles, instrument),
@@ -54,8 +57,11 @@ def write_campaign_report(path: Path) -> None:
     write_results(folder, files)
 
 
-def draw_history(cycles: list[Cycle], telescope: str) -> Figure:
-    """A_sigma of every cycle with its uncertainty, and what each cycle's correction was to make of it."""
+def draw_history(cycles: list[Cycle], telescope: str, events: Sequence[Event] = ()) -> Figure:
+    """A_sigma of every cycle with its uncertainty, and what each cycle's correction was to make of it.
+
+    `events` is the campaign's journal: what a PSF camera saw is drawn beside the estimates of the same moments.
+    """
     figure = Figure(figsize=(7.0, 4.5), dpi=DPI, layout="constrained")
     axes = figure.subplots()
     numbers = [cycle.number for cycle in cycles]
@@ -68,6 +74,13 @@ def draw_history(cycles: list[Cycle], telescope: str) -> Figure:
     axes.plot(
         made + 1, predicted[:-1], "D", color=ORANGE, fillstyle="none", ms=10, label="predicted by the cycle before"
     )
+    seen = [event.data for event in events if event.kind == PSF_CHECK and event.data.get("cycle") in numbers]
+    if seen:
+        areas, doubts = (
+            [rad2_to_arcmin2(float(str(data[name]))) for data in seen] for name in ("a_sigma_rad2", "uncertainty_rad2")
+        )
+        at = [int(str(data["cycle"])) + BESIDE for data in seen]
+        axes.errorbar(at, areas, yerr=doubts, fmt="s", color=VERMILLION, capsize=4, label="seen by the PSF camera")
     limit = rad2_to_arcmin2(cycles[-1].a_sigma_limit_rad2)
     if math.isfinite(limit):
         axes.axhline(limit, color=SKY, linestyle="--", label="ray-traced, mirrors without errors")

@@ -28,6 +28,8 @@ _COMMANDS = {
     "compare": "namod_ctl.app.commands.compare:compare",
     "rereduce": "namod_ctl.app.commands.rereduce:rereduce",
     "calibrate": "namod_ctl.app.commands.calibrate:app",
+    "psf": "namod_ctl.app.commands.psf:psf",
+    "lut": "namod_ctl.app.commands.lut:app",
     "export": "namod_ctl.app.commands.export:export",
     "raytrace": "namod_ctl.app.commands.raytrace:raytrace",
     "status": "namod_ctl.app.commands.status:status",

@@ -12,6 +12,7 @@ from namod_ctl.core.units import rad2_to_arcmin2, rad_to_arcmin, rad_to_deg
 from namod_ctl.reconstruction.alignment import AreaOfPsf, FacetAlignment
 from namod_ctl.reconstruction.estimators import DEFAULT_ESTIMATOR
 from namod_ctl.reconstruction.halves import HalvesComparison
+from namod_ctl.reconstruction.normalization import slope_in_words
 from namod_ctl.reconstruction.reconstruct import Reconstruction
 
 REPORT_FILE = "report.txt"
@@ -65,6 +66,7 @@ def report_text(result: Reconstruction, n_rejected: Mapping[RejectReason, int]) 
     for record in alignment.bad_records:
         facets = ", ".join(str(facet_id) for facet_id in record.facet_ids)
         lines.append(f"  {record.index:5d}  {record.kind}: {record.detail}" + (f"; facets {facets}" if facets else ""))
+    lines += ["", "Normalization", *(f"  {line}" for line in _normalization_lines(result))]
     lines += ["", "What that changes", *(f"  {remark}" for remark in alignment.remarks), ""]
     if alignment.facets_not_in_run:
         missing = ", ".join(str(facet_id) for facet_id in alignment.facets_not_in_run)
@@ -86,6 +88,24 @@ def report_text(result: Reconstruction, n_rejected: Mapping[RejectReason, int]) 
     if remarks:
         lines += ["", "Remarks", *remarks]
     return "\n".join(lines) + "\n"
+
+
+def _normalization_lines(result: Reconstruction) -> list[str]:
+    """How responses depended on the star's brightness, and what was done about it."""
+    found = result.normalization
+    if not found.is_known:
+        return [f"whether responses depend on the star's brightness is not known: {found.doubt}"]
+    slope = f"responses against the star's brightness: {slope_in_words(found)}"
+    if result.removed_exponent:
+        return [slope, "significant; the self-calibration has taken it out of all responses"]
+    if found.is_implausible:
+        return [
+            slope,
+            "no calibration is off by that much: was it the star that the facets showed? Nothing was changed",
+        ]
+    if found.is_significant:
+        return [slope, "significant, and still in the responses: the self-calibration was off"]
+    return [slope, "not significant; the responses are as recorded"]
 
 
 def _facet_line(facet: FacetAlignment) -> str:

@@ -11,7 +11,7 @@ from dataclasses import replace
 from namod_ctl.core.clock import Clock
 from namod_ctl.core.errors import ConfigError, DataQualityError, NamodError, SafetyStop
 from namod_ctl.core.motion import StopSwitch
-from namod_ctl.cycle.campaign_memory import alignments_on_record, cycle_to_record, history_of, note_forecast
+from namod_ctl.cycle.campaign_memory import alignments_on_record, cycle_to_record, history_of, note_forecast, open_run
 from namod_ctl.cycle.campaign_parts import CampaignSettings, Outside, View
 from namod_ctl.cycle.control import OF_FACETS, ControlBox, Request, RequestKind
 from namod_ctl.cycle.convergence import Decision, decide
@@ -19,6 +19,7 @@ from namod_ctl.cycle.correct import Corrector, StopAsked
 from namod_ctl.cycle.machine import FINAL, CampaignMachine
 from namod_ctl.cycle.plan import Plan
 from namod_ctl.cycle.progress import Progress
+from namod_ctl.cycle.psf_check import AT_FIRST, check_psf, was_checked
 from namod_ctl.cycle.record import Recorder, StopRule
 from namod_ctl.cycle.turn_marks import FacetIds, left, unmark
 from namod_ctl.optics.instrument import Instrument
@@ -100,12 +101,15 @@ class Campaign:
                     self._poll()
         except (StopAsked, SafetyStop, DataQualityError) as stop:
             self._hold(str(stop))
+            if isinstance(stop, StopAsked):  # who stops it does not want to wait for a camera
+                return self.state
         except KeyboardInterrupt as stop:
             self._hold(f"stopped by {stop}" if str(stop) else "stopped by Ctrl-C")
             raise
         except BaseException as error:
             self._hold(f"{type(error).__name__}: {error}" if str(error) else type(error).__name__)
             raise
+        check_psf(self._store, self._outside.psf_equipment, f"in the end ({self.state})", self._view.told)
         return self.state
 
     # -- the states -------------------------------------------------------------------------------------------------
@@ -127,7 +131,7 @@ class Campaign:
 
     def _in_recording(self) -> None:
         cycle = cycle_to_record(self._store)
-        with self._run_of(cycle) as run:
+        with open_run(self._store, cycle, self._instrument.reflector.ids, self._clock) as run:
             recorder = Recorder(self._outside.equipment(), self._instrument, run, self._settings.record)
 
             def on_progress(progress: Progress) -> None:
@@ -198,6 +202,8 @@ class Campaign:
                 kept = [f"facet {number}: {text}" for number, text in plan.refused.items()]
                 raise SafetyStop("; ".join([why, *kept]))
             case Decision.CORRECT:
+                if not was_checked(self._store, AT_FIRST):
+                    check_psf(self._store, self._outside.psf_equipment, AT_FIRST, self._view.told)
                 self._machine.fire("correct", why)
 
     def _in_previewing(self) -> None:
@@ -327,13 +333,6 @@ class Campaign:
         if n_undone or not self._corrector.can_undo:
             raise SafetyStop(f"{why}; {'it was undone once already' if n_undone else 'people must look'}")
         self._machine.fire("undo", why)
-
-    def _run_of(self, cycle: Cycle) -> RunStore:
-        path = self._store.run_path(cycle.number)
-        if path.exists():
-            return RunStore.open(path, read_only=False)
-        source = f"cycle {cycle.number} of {self._store.path.name}"
-        return RunStore.create(path, self._instrument.reflector.ids, self._store.config_json, source, self._clock)
 
     def _reconstructed(self, cycle: Cycle) -> Reconstruction:
         path = self._store.run_path(cycle.number)

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+from namod_ctl.core.clock import Clock
 from namod_ctl.cycle.convergence import Measurement
 from namod_ctl.cycle.plan import Plan
 from namod_ctl.reconstruction.alignment import Alignment
 from namod_ctl.store.campaign import CampaignStore
 from namod_ctl.store.campaign_rows import Cycle
+from namod_ctl.store.run import RunStore
 
 NOTE_FORECASTS = "forecasts"
 
@@ -22,6 +24,15 @@ def cycle_to_record(store: CampaignStore) -> Cycle:
         return cycles[-1]
     number = store.begin_cycle()
     return next(cycle for cycle in store.cycles() if cycle.number == number)
+
+
+def open_run(store: CampaignStore, cycle: Cycle, facet_ids: Sequence[int], clock: Clock) -> RunStore:
+    """The run of a cycle, open for writing; begun if it does not exist yet."""
+    path = store.run_path(cycle.number)
+    if path.exists():
+        return RunStore.open(path, read_only=False)
+    source = f"cycle {cycle.number} of {store.path.name}"
+    return RunStore.create(path, facet_ids, store.config_json, source, clock)
 
 
 def alignments_on_record(

@@ -9,6 +9,7 @@ from typing import Literal
 
 from namod_ctl.cycle.plan import Plan
 from namod_ctl.cycle.progress import Progress
+from namod_ctl.cycle.psf_check import OpenPsfEquipment
 from namod_ctl.cycle.record import Equipment, RecordSettings
 from namod_ctl.reconstruction.alignment import Alignment
 from namod_ctl.reconstruction.reconstruct import Reconstruction
@@ -80,9 +81,12 @@ class Outside:
         The machine-readable form of an alignment; reading takes the name of the source as well.
     write_results
         Writes tables and pictures of a reconstruction into its run's folder.
+    psf_equipment
+        Opens the PSF camera, anew for each look; None where there is none.
     """
 
     equipment: Callable[[], Equipment]
     alignment_to_json: Callable[[Alignment], str]
     alignment_from_json: Callable[[str, str], Alignment]
     write_results: Callable[[Path, Reconstruction], None]
+    psf_equipment: OpenPsfEquipment | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -19,10 +20,17 @@ from namod_ctl.reconstruction.alignment import Alignment, AreaOfPsf, BadRecord, 
 from namod_ctl.reconstruction.bad_records import find_bad_records
 from namod_ctl.reconstruction.correction import FacetCorrection, common_centre, correct
 from namod_ctl.reconstruction.estimators import DEFAULT_ESTIMATOR, ESTIMATOR_NAMES, SIMPLE_ESTIMATORS, Centres
-from namod_ctl.reconstruction.facet_fit import FacetFit, centre_covariance
+from namod_ctl.reconstruction.facet_centres import brightest_is_bad, robust_centres, simple_flags, with_doubt_of_slope
+from namod_ctl.reconstruction.facet_fit import FacetFit
 from namod_ctl.reconstruction.facet_psf import CENTRE, background_of, covariance_of_light
+from namod_ctl.reconstruction.normalization import (
+    Normalization,
+    measure_normalization,
+    removal_in_words,
+    without_slope,
+)
 from namod_ctl.reconstruction.psf import area_now, area_of_histograms, area_predicted, light_of_fits
-from namod_ctl.reconstruction.quality import ScanRegion, judge_fit, n_lit_records
+from namod_ctl.reconstruction.quality import ScanRegion, n_lit_records
 from namod_ctl.reconstruction.responses import ResponseTable
 from namod_ctl.reconstruction.robust import Family, fit_reflector
 from namod_ctl.reconstruction.scene import without_scene
@@ -34,6 +42,9 @@ DEFAULT_BIN_SIZE_RAD = deg_to_rad(0.01)
 MIN_RECORDS = 10
 _N_SCREENINGS = 3  # without the worst records the fits may show further ones
 _N_SCENES = 2  # the first fits to a run under clouds are too wide, and hide some of the scene
+_N_SELF_CALIBRATIONS = 2  # the first leaves a few per cent of what it removed
+_LEFT_SIGMA = 0.2
+_TRIAL_SIGMA = 2.0  # far enough from nothing to see the difference
 _RAYS_PER_FACET = 500
 
 
@@ -51,6 +62,10 @@ class Reconstruction:
         A_sigma of the summed H_psf in rad^2: of all records, without the bad ones, and without background as well.
     limit
         Ray-traced area of the same reflector perfectly aligned.
+    normalization
+        How the responses depended on the star's intensity when they were recorded.
+    removed_exponent
+        What the self-calibration took out of `table` and `used`; 0 where it left them as they are.
     """
 
     alignment: Alignment
@@ -60,6 +75,21 @@ class Reconstruction:
     fits: tuple[FacetFit | None, ...]
     histogram_areas: tuple[float, float, float]
     limit: AreaOfPsf
+    normalization: Normalization
+    removed_exponent: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FittedRun:
+    """A response table with the fits to it, see `Reconstruction` for the words."""
+
+    table: ResponseTable
+    used: ResponseTable
+    bad: list[BadRecord]
+    family: Family
+    fits: list[FacetFit | None]
+    normalization: Normalization
+    removed_exponent: float
 
 
 def reconstruct(
@@ -67,11 +97,14 @@ def reconstruct(
     instrument: Instrument,
     estimator: str = DEFAULT_ESTIMATOR,
     bin_size_rad: float = DEFAULT_BIN_SIZE_RAD,
+    *,
+    self_calibration: bool = True,
 ) -> Reconstruction:
     """Alignment of all facets of a run.
 
     The light, its area and the bad records always come from the robust fits; `estimator` decides where the centres
-    and with them the corrections come from.
+    and with them the corrections come from. Whatever the estimator, `self_calibration` first takes out of the responses
+    what the records show to depend on the star's intensity, where that is certain.
 
     Raises
     ------
@@ -82,21 +115,19 @@ def reconstruct(
     """
     if estimator not in ESTIMATOR_NAMES:
         raise ConfigError(f"unknown estimator {estimator!r}: choose one of {', '.join(ESTIMATOR_NAMES)}")
-    if table.n_records < MIN_RECORDS:
-        raise DataQualityError(f"{table.n_records} records count, at least {MIN_RECORDS} are needed: record longer")
-    unknown = sorted(set(table.facet_ids) - set(instrument.reflector.ids))
-    if unknown:
-        raise ConfigError(f"facet ids {unknown} of the run are not in the config of {instrument.name}")
+    fitted = fit_run(table, instrument, self_calibration=self_calibration)
+    table, used, bad, family, fits = fitted.table, fitted.used, fitted.bad, fitted.family, fitted.fits
     expected_rad = expected_size_rad(instrument)
-    bad, used, family, fits = _screen(table, expected_rad)
     factors = repetition_factor(used, family) * misfit_factors(fits)
     size_rad = min(float(np.exp(family.log_size)), expected_rad)
     region = ScanRegion(used.theta_rad)
     if estimator == DEFAULT_ESTIMATOR:
-        centres, flags, remarks = _robust_centres(used, fits, factors, region, size_rad)
+        centres, flags, remarks = robust_centres(used, fits, factors, region, size_rad)
+        if fitted.removed_exponent:
+            centres = with_doubt_of_slope(centres, used, fits, fitted.normalization)
     else:
         centres = SIMPLE_ESTIMATORS[estimator](table, bin_size_rad)
-        flags, remarks = _simple_flags(table, centres, bad, estimator)
+        flags, remarks = simple_flags(table, centres, bad, estimator)
     flux = np.array([np.nan if fit is None else light_of_fits([fit]).flux[0] for fit in fits])
     axis_rad = np.zeros(2)
     if not instrument.star_camera.axis_is_calibrated:
@@ -132,9 +163,62 @@ def reconstruct(
         ),
         bad_records=tuple(bad),
         facets_not_in_run=tuple(sorted(set(instrument.reflector.ids) - set(table.facet_ids))),
-        remarks=_remarks(table, bad, histogram_areas, bin_size_rad),
+        remarks=_remarks(table, bad, histogram_areas, bin_size_rad)
+        + ((removal_in_words(fitted.normalization),) if fitted.removed_exponent else ()),
     )
-    return Reconstruction(alignment, table, used, family, tuple(fits), histogram_areas, limit)
+    return Reconstruction(
+        alignment,
+        table,
+        used,
+        family,
+        tuple(fits),
+        histogram_areas,
+        limit,
+        fitted.normalization,
+        fitted.removed_exponent,
+    )
+
+
+def fit_run(table: ResponseTable, instrument: Instrument, *, self_calibration: bool = True) -> FittedRun:
+    """The fits of all facets to the records that agree with each other, and how responses depend on the star.
+
+    Raises
+    ------
+    ConfigError
+        Facets that the instrument does not have.
+    DataQualityError
+        Too few records, or no light at all.
+    """
+    if table.n_records < MIN_RECORDS:
+        raise DataQualityError(f"{table.n_records} records count, at least {MIN_RECORDS} are needed: record longer")
+    unknown = sorted(set(table.facet_ids) - set(instrument.reflector.ids))
+    if unknown:
+        raise ConfigError(f"facet ids {unknown} of the run are not in the config of {instrument.name}")
+    expected_rad = expected_size_rad(instrument)
+    given, removed = table, 0.0
+    bad, used, family, fits = _screen(given, expected_rad)
+    left = measure_normalization(used, fits)
+    share = 1.0
+    if left.is_known:
+        share = _share_noticed(used, left, expected_rad)
+        left = left.with_refits(share)
+    if self_calibration and left.is_worth_removing:
+        for _ in range(_N_SELF_CALIBRATIONS):
+            removed += left.exponent
+            table = without_slope(given, removed)
+            bad, used, family, fits = _screen(table, expected_rad)
+            left = measure_normalization(used, fits).with_refits(share)
+            if not abs(left.exponent) > _LEFT_SIGMA * left.exponent_uncertainty:
+                break
+    return FittedRun(table, used, bad, family, fits, left.beside(removed), removed)
+
+
+def _share_noticed(used: ResponseTable, found: Normalization, expected_rad: float) -> float:
+    """Share of an exponent that the measurement notices when it is taken out and the facets are fitted anew."""
+    trial = found.exponent + math.copysign(_TRIAL_SIGMA * found.exponent_uncertainty, found.exponent)
+    table = without_slope(used, trial)
+    _, fits = fit_reflector(table, expected_rad)
+    return (found.exponent - measure_normalization(table, fits).exponent) / trial
 
 
 def expected_size_rad(instrument: Instrument) -> float:
@@ -174,47 +258,6 @@ def _screen(
             )
         family, fits = fit_reflector(used, expected_rad)
     return bad, used, family, fits
-
-
-def _robust_centres(
-    used: ResponseTable, fits: Sequence[FacetFit | None], factors: Array, region: ScanRegion, size_rad: float
-) -> tuple[Centres, list[FacetFlag], list[tuple[str, ...]]]:
-    n = len(fits)
-    theta, cov = np.full((n, 2), np.nan), np.full((n, 2, 2), np.nan)
-    flags: list[FacetFlag] = []
-    remarks: list[tuple[str, ...]] = []
-    for j, fit in enumerate(fits):
-        if fit is None:
-            flags.append(FacetFlag.NO_SIGNAL)
-            remarks.append(("its response is zero in every record",))
-            continue
-        facet_cov = factors[j] * centre_covariance(fit)
-        verdict = judge_fit(fit, used, j, facet_cov, region, size_rad)
-        flags.append(verdict.flags)
-        remarks.append(verdict.remarks)
-        if not verdict.flags & FacetFlag.NO_SIGNAL:
-            theta[j], cov[j] = fit.parameters[CENTRE], verdict.centre_cov_rad2
-    return Centres(theta, cov), flags, remarks
-
-
-def _simple_flags(
-    table: ResponseTable, centres: Centres, bad: Sequence[BadRecord], estimator: str
-) -> tuple[list[FacetFlag], list[tuple[str, ...]]]:
-    """Flags of an estimator that takes records at face value: only what it must not hide."""
-    flags = [FacetFlag.NONE if np.isfinite(theta).all() else FacetFlag.NO_SIGNAL for theta in centres.theta_rad]
-    remarks: list[tuple[str, ...]] = [() for _ in flags]
-    if estimator == "brightest":
-        for j, record in _brightest_is_bad(table, bad).items():
-            flags[j] |= FacetFlag.RESTS_ON_BAD_RECORD
-            remarks[j] = (f"its brightest record is number {record.index}, {record.kind}: {record.detail}",)
-    return flags, remarks
-
-
-def _brightest_is_bad(table: ResponseTable, bad: Sequence[BadRecord]) -> dict[int, BadRecord]:
-    """Columns of the facets whose single brightest record is a bad one."""
-    by_index = {record.index: record for record in bad}
-    brightest = table.record_index[np.argmax(np.nan_to_num(table.response), axis=0)]
-    return {j: by_index[int(index)] for j, index in enumerate(brightest) if int(index) in by_index}
 
 
 def _facet(
@@ -315,7 +358,7 @@ def _remarks(
         f"records, {without_bad:.1f} without the {len(bad)} bad ones, {without_background:.1f} without the facets' "
         "background as well"
     ]
-    for j, record in _brightest_is_bad(table, bad).items():
+    for j, record in brightest_is_bad(table, bad).items():
         lines.append(
             f"facet {table.facet_ids[j]}: its single brightest record is number {record.index} ({record.kind}): turns "
             "computed from it are wrong"

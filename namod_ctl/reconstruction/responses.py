@@ -63,19 +63,22 @@ class ResponseTable:
         )
 
 
-def tabulate_responses(records: Iterable[Record], facet_ids: Sequence[int]) -> ResponseTable:
+def tabulate_responses(
+    records: Iterable[Record], facet_ids: Sequence[int], *, is_at_rest: bool = False
+) -> ResponseTable:
     """Response table of the records that count; rejected ones are left out.
 
     An unlit facet still shows the faint scene around the telescope, which does not fade with the star. Where the star's
     brightness varied over the run (clouds, zenith distance, another star), the scene of each facet, its dim
     records' intensity, is therefore taken off before the intensity is divided by that of the star. What changes in the
-    scene meanwhile is taken off by `scene`, when the facets' light is known.
+    scene meanwhile is taken off by `scene`, when the facets' light is known. Not so where the light is `is_at_rest`,
+    all records in one direction: then a facet's dim records show it lit by a dim light.
     """
     accepted = [record for record in records if record.reject_reason is None]
     n = len(accepted)
     intensity = np.array([record.facet_intensity for record in accepted], dtype=np.float64).reshape(n, len(facet_ids))
     star = np.array([record.star_intensity for record in accepted], dtype=np.float64)
-    if n >= _MIN_FOR_SCENE and star.max() > _VARIED * star.min():
+    if not is_at_rest and n >= _MIN_FOR_SCENE and star.max() > _VARIED * star.min():
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # a facet that was never measured stays NaN
             intensity = intensity - np.nanquantile(intensity, _SCENE_QUANTILE, axis=0)

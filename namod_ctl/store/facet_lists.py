@@ -1,7 +1,8 @@
 """Facet lists of the simulations: Mars/Ceres reflector files and sim_telarray mirror lists.
 
-Both are in cm, in their own telescope frame, whose x and y are taken as they are. Neither form says
-how a Mars hexagon is turned: it is taken to have a corner at +y, as FACT's.
+Both are in cm. The frame of Mars/Ceres files is taken as the telescope frame; nothing in them says how a hexagon is
+turned: it is taken to have a corner at +y, as FACT's. In sim_telarray's frame x points down, with the telescope above
+the horizon, and y is the telescope frame's x (docs/exports.md has the sources).
 """
 
 from __future__ import annotations
@@ -35,13 +36,14 @@ MARS_COLUMNS = ("x", "y", "z", "nx", "ny", "nz", "f", "type", "fD")
 MARS_IDS = "# facet ids, row by row:"
 NORMAL_LENGTH_TOLERANCE = 0.01
 
-# Code 1 is the hexagon whose flats are parallel to y (they face +-x), code 3 the one turned by 30 deg.
+# Code 1 is the hexagon whose flats face sim_telarray's +-x (the telescope frame's -+y), code 3 the one turned to it.
 SIM_SHAPES = {
     "0": (FacetShape.ROUND, 0.0),
-    "1": (FacetShape.HEXAGON, 0.0),
+    "1": (FacetShape.HEXAGON, 30.0),
     "2": (FacetShape.SQUARE, 0.0),
-    "3": (FacetShape.HEXAGON, 30.0),
+    "3": (FacetShape.HEXAGON, 0.0),
 }
+SIM_LEAST_Z_CM = 1e-6  # 10 nm: sim_telarray takes a z of 0 as "on the dish, wherever that is"
 SIM_ID = re.compile(r"\bid\s*=\s*([0-9]{1,6})\b")
 
 POSITION_LIMIT_CM = 5000.0
@@ -176,7 +178,7 @@ def read_sim_telarray(path: Path, dish: Dish, ids: Sequence[int] | None = None) 
 
 
 def parse_sim_telarray(text: str, source: str, dish: Dish, ids: Sequence[int] | None = None) -> FacetList:
-    """The facets of a sim_telarray mirror list, rows `x y diameter focal_length shape [z] [#% id=..]`.
+    """The facets of a sim_telarray mirror list, rows `x y diameter focal_length shape [z] [#% id=..]`, in our frame.
 
     A row without z stands on `dish`; a focal length of 0 means the distance to the focal point. Ids come from `ids`,
     else from `#% id=..` if every row has one, else they count the rows from 1.
@@ -222,7 +224,7 @@ def _sim_facet(row: Row, facet_id: int, dish: Dish) -> Facet:
     if row.fields[4] not in SIM_SHAPES:
         raise row.problem(f"column 5 (shape) holds {row.fields[4]!r}, known are 0 round, 1 and 3 hexagon, 2 square")
     shape, rotation_deg = SIM_SHAPES[row.fields[4]]
-    x_m, y_m = cm_to_m(x_cm), cm_to_m(y_cm)
+    x_m, y_m = cm_to_m(y_cm), -cm_to_m(x_cm)
     if len(row.fields) == 6:
         z_m = cm_to_m(row.number(5, "z", -POSITION_LIMIT_CM, POSITION_LIMIT_CM, "cm"))
     else:
@@ -245,19 +247,25 @@ def _sim_facet(row: Row, facet_id: int, dish: Dish) -> Facet:
 
 
 def format_sim_telarray(reflector: Reflector) -> str:
-    """A sim_telarray mirror list, z always written, before `#%`.
+    """A sim_telarray mirror list in sim_telarray's frame, z always written, before `#%`.
 
     Raises
     ------
     ConfigError
-        A facet is turned in a way the form has no code for.
+        A facet is turned in a way the form has no code for, or lies below the dish's vertex.
     """
     out = ["# Mirror list for sim_telarray. Columns: x y diameter focal_length [cm] shape z [cm] #% id"]
     for facet in reflector.facets:
         x_cm, y_cm, z_cm = (m_to_cm(float(value_m)) for value_m in facet.position_m)
+        if z_cm < -SIM_LEAST_Z_CM:
+            raise ConfigError(
+                f"facet {facet.id}: its centre lies {-z_cm:.3f} cm below the dish's vertex, and sim_telarray takes the "
+                "absolute value of z; move the telescope frame's origin down in the config, or use another form"
+            )
+        place = " ".join(f"{round(value_cm, 6) + 0.0:.6f}" for value_cm in (-y_cm, x_cm))  # never -0
         out.append(
-            f"{x_cm:.6f} {y_cm:.6f} {m_to_cm(facet.width_m):.6f} {m_to_cm(facet.focal_length_m):.6f} "
-            f"{_sim_shape_code(facet)} {z_cm:.6f} #% id={facet.id}"
+            f"{place} {m_to_cm(facet.width_m):.6f} {m_to_cm(facet.focal_length_m):.6f} "
+            f"{_sim_shape_code(facet)} {max(z_cm, SIM_LEAST_Z_CM):.6f} #% id={facet.id}"
         )
     return "\n".join(out) + "\n"
 

@@ -60,6 +60,7 @@ class TwinReflector:
         seen_outlines_m: Sequence[Array],
         settings: ReflectorSettings,
         seed: int,
+        came_from_zenith_rad: float = 0.0,
     ) -> None:
         n = len(reflector.facets)
         self._config = reflector
@@ -90,6 +91,10 @@ class TwinReflector:
         # Facets sink towards -y, the lower rim of a dish that leans over its elevation axis; none rises.
         sag = np.column_stack([0.2 * draw("sag sideways"), -np.exp(0.4 * draw("sag"))])
         self._sag_rad = settings.sag_rad * sag
+        across_m = reflector.positions_m[:, :2]
+        rim_m = float(np.linalg.norm(across_m, axis=1).max()) or 1.0  # a single facet may lie on the axis
+        self._bending_rad = settings.bending_rad * (across_m / rim_m + 0.2 * draw("bending", 2))
+        self._came_from_zenith_rad = came_from_zenith_rad
         self._drift_rad_per_kelvin = settings.drift_rad_per_kelvin * draw("drift", 2)
         self._driven_tilt_rad = np.zeros((n, 2))  # by motors, since the twin began
         self._sag_zenith_rad: list[float] = []  # the zenith distance that the sag has followed to, tick by tick
@@ -113,16 +118,20 @@ class TwinReflector:
         lag = self._settings.sag_hysteresis_rad
         while len(self._sag_zenith_rad) * TICK_S <= time_s:
             zenith_rad = zenith_distance_rad(len(self._sag_zenith_rad) * TICK_S)
-            # At first the telescope comes from its park position at zenith.
-            before = self._sag_zenith_rad[-1] if self._sag_zenith_rad else max(zenith_rad - lag, 0.0)
+            before = self._sag_zenith_rad[-1] if self._sag_zenith_rad else self._came_from_zenith_rad
             self._sag_zenith_rad.append(min(max(before, zenith_rad - lag), zenith_rad + lag))
 
     def moved_rad(self, time_s: float) -> Array:
         """Tilt by sag and drift, shape (n_facets, 2), at a moment up to which `update` was called."""
         tick = int(time_s // TICK_S)
         kelvin = -self._settings.cooling_kelvin_per_hour * tick * TICK_S / SECONDS_PER_HOUR
-        moved: Array = self._sag_rad * math.sin(self._sag_zenith_rad[tick]) + self._drift_rad_per_kelvin * kelvin
-        return moved
+        return self.sag_rad(self._sag_zenith_rad[tick]) + self._drift_rad_per_kelvin * kelvin
+
+    def sag_rad(self, zenith_rad: float) -> Array:
+        """Tilt by gravity alone, shape (n_facets, 2), of a dish whose play is taken up at that zenith distance."""
+        bent = self._bending_rad * (1.0 - math.cos(zenith_rad))
+        sag: Array = self._sag_rad * math.sin(zenith_rad) + bent
+        return sag
 
     def theta_moved_rad(self, truth: FacetTruth, time_s: float) -> Array:
         """By how much sag and drift have moved the facets' true Theta at that moment, shape (n_facets, 2)."""
@@ -179,6 +188,17 @@ class TwinReflector:
     def a_sigma_now_rad2(self) -> float:
         """A_sigma of the star on the axis, facets as they are at present, by exact ray tracing."""
         return self._a_sigma(self.true_tilt_rad)
+
+    def a_sigma_at_rad2(self, zenith_rad: float) -> float:
+        """The same if the telescope stood at that zenith distance, without drift and play."""
+        return self._a_sigma(self.base_tilt_rad + self.sag_rad(zenith_rad))
+
+    def correction_at_rad(self, zenith_rad: float) -> Array:
+        """Phi, shape (n_facets, 2), to first order, that aligns all facets at that zenith distance."""
+        truth = self.truth
+        theta = truth.theta_rad + np.einsum("fab,fb->fa", truth.theta_per_tilt, self.sag_rad(zenith_rad))
+        correction: Array = -np.linalg.solve(truth.theta_per_tilt, theta[..., None])[..., 0]
+        return correction
 
     def a_sigma_aligned_rad2(self) -> float:
         """A_sigma of the same facets, each with its light's centroid on the focal point: the limit of alignment."""

@@ -54,6 +54,9 @@ class ReflectorSettings:
         Standard deviation per axis of the facets' tilt per degree of temperature.
     cooling_kelvin_per_hour
         How fast the night cools the dish.
+    bending_rad
+        Tilt by which the outermost facets turn outwards when the telescope turns from zenith to horizon, as the weight
+        along the axis goes; those further in turn less, in proportion. A fifth of it differs from facet to facet.
     """
 
     __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
@@ -69,6 +72,7 @@ class ReflectorSettings:
     sag_hysteresis_rad: Annotated[float, Limits(0.0, deg_to_rad(90.0))] = deg_to_rad(2.0)
     drift_rad_per_kelvin: Annotated[float, ANGLE] = arcmin_to_rad(0.02)
     cooling_kelvin_per_hour: Annotated[float, Limits(-20.0, 20.0)] = 0.5
+    bending_rad: Annotated[float, ANGLE] = 0.0
 
 
 PERFECT = ReflectorSettings(0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -124,6 +128,8 @@ class TelescopeSettings:
         Standard deviation per axis of the drives' tracking error.
     slew_s
         How long a change of star takes; meanwhile no star is in the field.
+    came_from_zenith_rad
+        Zenith distance of the park position from which the telescope turned to its first star.
     """
 
     __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
@@ -135,6 +141,7 @@ class TelescopeSettings:
     speed_rad_per_s: Annotated[float, Limits(arcsec_to_rad(0.01), deg_to_rad(5.0))] = arcmin_to_rad(1.0)
     jitter_rad: Annotated[float, Limits(0.0, deg_to_rad(1.0))] = arcmin_to_rad(0.03)
     slew_s: Annotated[float, Limits(0.0, 3600.0)] = 10.0
+    came_from_zenith_rad: Annotated[float, Limits(0.0, deg_to_rad(90.0))] = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -69,7 +69,12 @@ class Twin:
         self.sky = Sky(settings.sky, settings.telescope, telescope, self._faults, seed)
         pixels = map_facets(instrument.reflector, instrument.reflector_camera, instrument.facet_polygons_px)
         self.reflector = TwinReflector(
-            instrument.reflector, instrument.mounts, [p.outline_m for p in pixels], settings.reflector, seed
+            instrument.reflector,
+            instrument.mounts,
+            [p.outline_m for p in pixels],
+            settings.reflector,
+            seed,
+            settings.telescope.came_from_zenith_rad,
         )
         self.aperture_radius_m = (
             FACT_APERTURE_RAD * instrument.reflector.focal_length_m

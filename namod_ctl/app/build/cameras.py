@@ -14,7 +14,7 @@ from namod_ctl.devices.cameras.lifeline import Lifeline
 from namod_ctl.devices.cameras.settings import CameraSettings
 from namod_ctl.devices.usb_reset import reset_for
 
-Role = Literal["star", "reflector"]
+Role = Literal["star", "reflector", "psf"]
 
 CAMERA_CLASSES = {
     "pylon": "PylonCamera",
@@ -53,9 +53,9 @@ def has_cameras(config: InstrumentConfig) -> bool:
 
 def camera_settings(config: InstrumentConfig, role: Role) -> CameraSettings:
     """What the driver of that camera is told. Raises ConfigError when the config names no device for it."""
-    camera = config.star_camera if role == "star" else config.reflector_camera
-    device = camera.device
-    if device is None:
+    camera = {"star": config.star_camera, "reflector": config.reflector_camera, "psf": config.psf_camera}[role]
+    device = None if camera is None else camera.device
+    if camera is None or device is None:
         raise ConfigError(
             f'the config names no device for the {role} camera; add [{role}_camera.device] driver = "..."'
         )

@@ -22,6 +22,7 @@ from namod_ctl.cycle.correct import Corrector
 from namod_ctl.cycle.correct_by_hand import ManualCorrector
 from namod_ctl.cycle.correct_by_motor import MotorCorrector
 from namod_ctl.cycle.mover import Mover
+from namod_ctl.cycle.psf_check import OpenPsfEquipment
 from namod_ctl.cycle.record import Equipment
 from namod_ctl.devices.buses import DriveBus
 from namod_ctl.optics.instrument import Instrument
@@ -68,9 +69,9 @@ def correct_by_motors(
     return MotorCorrector(store, instrument, mover, drives, motion, clock)
 
 
-def campaign_outside(open_equipment: Callable[[], Equipment]) -> Outside:
+def campaign_outside(open_equipment: Callable[[], Equipment], open_psf: OpenPsfEquipment | None) -> Outside:
     """What a campaign needs from above: its cameras, opened anew for each recording, and the files of its results."""
-    return Outside(open_equipment, alignment_to_json, alignment_from_json, _write_cycle)
+    return Outside(open_equipment, alignment_to_json, alignment_from_json, _write_cycle, open_psf)
 
 
 def _write_cycle(run: Path, result: Reconstruction) -> None:

@@ -13,8 +13,8 @@ from pydantic import TypeAdapter, ValidationError
 
 from namod_ctl.app.build.instrument import build_instrument
 from namod_ctl.app.build.twin_limits import Origins, as_written, beyond_limits, in_radians
+from namod_ctl.app.config.camera_schema import DeviceCameraSection
 from namod_ctl.app.config.instrument import CAMERA_SECTIONS, InstrumentConfig
-from namod_ctl.app.config.schema import DeviceCameraSection
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.optics.camera_model import CameraModel
 from namod_ctl.optics.instrument import Instrument

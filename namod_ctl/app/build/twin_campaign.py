@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 from namod_ctl.app.build.bench_sky import twin_equipment
 from namod_ctl.app.build.correctors import campaign_outside, correct_by_motors, correct_by_people
+from namod_ctl.app.build.psf_camera import twin_psf_equipment
 from namod_ctl.app.build.recording import build_record_settings
 from namod_ctl.app.build.twin import build_twin, instrument_on_twin
 from namod_ctl.app.build.twin_actuators import build_twin_actuators, twin_wiring
@@ -65,14 +66,13 @@ def open_twin_campaign(
             keep_frames=wishes.record.keep_frames,
         )
         instrument = instrument_on_twin(config)
-        outside = campaign_outside(stack.enter_context(twin_equipment(config, twin)))
+        cameras = stack.enter_context(twin_equipment(config, twin))
+        outside = campaign_outside(cameras, twin_psf_equipment(config, twin, seed))
         if config.actuators is None:
             operator = TwinOperator(twin, seed, mistakes=mistakes)
             corrector = correct_by_people(store, instrument, operator.turn)
         else:
             buses = stack.enter_context(build_twin_actuators(config, twin.drives))
             corrector = correct_by_motors(store, config, instrument, buses, twin.clock, switch)
-        campaign = Campaign(
-            store, instrument, corrector, outside, replace(wishes, record=record), clock, switch, view
-        )
+        campaign = Campaign(store, instrument, corrector, outside, replace(wishes, record=record), clock, switch, view)
         yield TwinCampaign(campaign, twin)

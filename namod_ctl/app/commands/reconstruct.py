@@ -30,6 +30,7 @@ from namod_ctl.optics.instrument import Instrument
 from namod_ctl.reconstruction.estimators import DEFAULT_ESTIMATOR, ESTIMATOR_NAMES
 from namod_ctl.reconstruction.halves import compare_halves
 from namod_ctl.reconstruction.histograms import histogram_responses
+from namod_ctl.reconstruction.normalization import without_slope
 from namod_ctl.reconstruction.reconstruct import Reconstruction, reconstruct
 from namod_ctl.reconstruction.responses import tabulate_responses
 from namod_ctl.store.combine import NOTE_COMBINED
@@ -56,6 +57,13 @@ def reconstruct_run(
     halves: Annotated[
         bool, typer.Option("--halves", help="Also reconstruct even and odd records separately and compare them.")
     ] = False,
+    self_calibration: Annotated[
+        bool,
+        typer.Option(
+            "--self-calibration/--no-self-calibration",
+            help="Take out how responses depend on the star's brightness, where the records show it significantly.",
+        ),
+    ] = True,
 ) -> None:
     """Find the point spread function and orientation of every facet of a run.
 
@@ -92,7 +100,15 @@ def reconstruct_run(
             with console.status(f"combining {len(runs)} runs"):
                 folder = stack.enter_context(combined_run(runs, out, clock, force=force))
         had_instructions = any((run / name).exists() for name in _INSTRUCTIONS)
-        report = reconstruct_in(folder, estimator, deg_to_rad(bin_size_deg), clock, console, halves=halves)
+        report = reconstruct_in(
+            folder,
+            estimator,
+            deg_to_rad(bin_size_deg),
+            clock,
+            console,
+            halves=halves,
+            self_calibration=self_calibration,
+        )
     console.print(report, soft_wrap=True, markup=False)
     console.print(
         f"Written to {run}: {ALIGNMENT_FILE}, {REPORT_FILE}, tables and pictures. Next: namod-ctl instruct {run}",
@@ -109,7 +125,14 @@ def reconstruct_run(
 
 
 def reconstruct_in(
-    run: Path, estimator: str, bin_size_rad: float, clock: Clock, console: Console, *, halves: bool
+    run: Path,
+    estimator: str,
+    bin_size_rad: float,
+    clock: Clock,
+    console: Console,
+    *,
+    halves: bool,
+    self_calibration: bool = True,
 ) -> str:
     """The report of the run's reconstruction; it and all other results are in the run's folder then."""
     with RunStore.open(run, read_only=False) as store:
@@ -118,8 +141,11 @@ def reconstruct_in(
         table = tabulate_responses(records, store.facet_ids)
         n_rejected = Counter(record.reject_reason for record in records if record.reject_reason is not None)
         with console.status(f"fitting {len(table.facet_ids)} facets to {table.n_records} records"):
-            result = reconstruct(table, instrument, estimator, bin_size_rad)
-            comparison = compare_halves(table, instrument, estimator, bin_size_rad) if halves else None
+            result = reconstruct(table, instrument, estimator, bin_size_rad, self_calibration=self_calibration)
+            comparison = None
+            if halves:  # of the same responses: one half alone may not show what all records do
+                calibrated = without_slope(table, result.removed_exponent)
+                comparison = compare_halves(calibrated, instrument, estimator, bin_size_rad)
         report = report_text(result, n_rejected)
         made_of = store.note(NOTE_COMBINED)
         if made_of is not None:

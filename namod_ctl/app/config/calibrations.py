@@ -21,7 +21,7 @@ from namod_ctl.app.config.calibration_schema import (
     GeometryCalibration,
     RadiometricCalibration,
 )
-from namod_ctl.app.config.schema import DeviceCameraSection
+from namod_ctl.app.config.camera_schema import DeviceCameraSection
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.units import deg_to_rad, mdeg_to_rad
 from namod_ctl.optics.camera_model import CameraModel, DarkModel, Distortion, RadiometricLaw

@@ -1,4 +1,4 @@
-"""What a config may say about the device behind a camera: `[star_camera.device]`, `[reflector_camera.device]`."""
+"""What a config may say about any camera, and about the device behind it: `[star_camera.device]` and the like."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from namod_ctl.app.config.calibration_schema import Calibration
 from namod_ctl.app.config.section import FileName, Name, Section, within
 
 DriverName = Literal["pylon", "genicam", "ueye", "alpaca", "indi", "opencv", "folder"]
@@ -55,3 +56,32 @@ class DeviceSection(Section):
         if self.exposure_range_s is not None and self.exposure_range_s[0] > self.exposure_range_s[1]:
             raise ValueError("exposure_range_s must be the shortest and the longest exposure in s, in this order")
         return self
+
+
+class RadiometricLawSection(Section):
+    """log10(I) = r_resp log10(C) + r_expo log10(T in s) + r_const, C the response as a share of full scale."""
+
+    r_resp: Annotated[float, within(0.2, 5.0)]
+    r_expo: Annotated[float, within(-3.0, -0.2)]
+    r_const: Annotated[float, within(-10.0, 10.0)]
+
+
+AcceptedCalibration = Literal["expired", "foreign"]
+
+
+class DeviceCameraSection(Section):
+    """What any camera has.
+
+    `calibrations` are files, or written out; what they hold takes the place of what stands here.
+    `accept_calibrations` lets those pass that are expired, or foreign: of another camera by their serial number.
+    """
+
+    model: Name
+    serial_number: Name | None = None
+    columns: Annotated[int, within(64, 20_000)]
+    rows: Annotated[int, within(64, 20_000)]
+    full_scale_adu: Annotated[float, within(1.0, 65_535.0)]
+    saturation_share: Annotated[float, within(0.5, 1.0)]
+    device: DeviceSection | None = None
+    calibrations: Annotated[tuple[FileName | Calibration, ...] | None, Field(strict=False)] = None
+    accept_calibrations: Annotated[tuple[AcceptedCalibration, ...] | None, Field(strict=False)] = None

@@ -7,7 +7,7 @@ from collections.abc import Callable, Set
 import numpy as np
 
 from namod_ctl.app.config.actuator_problems import actuator_problems
-from namod_ctl.app.config.camera_problems import camera_problems
+from namod_ctl.app.config.camera_problems import camera_problems, psf_camera_problems
 from namod_ctl.app.config.parts import camera_of, mount_of, reflector_of
 from namod_ctl.app.config.schema import FacetSection, InstrumentSections
 from namod_ctl.app.views.number_ranges import runs_in_words
@@ -156,4 +156,5 @@ _CHECKS: tuple[tuple[frozenset[str], Callable[[InstrumentSections, str], list[st
     (frozenset({"reflector", "reflector_camera", "reflector_map"}), _bad_polygons),
     (frozenset({"recording", "star_camera", "reflector_camera"}), _bad_target),
     (frozenset({"star_camera", "reflector_camera"}), camera_problems),
+    (frozenset({"star_camera", "reflector_camera", "psf_camera"}), psf_camera_problems),
 )

@@ -37,6 +37,8 @@ from namod_ctl.store.facet_lists import read_mars, read_sim_telarray
 from namod_ctl.store.facet_tables import read_facet_table, read_polygon_table
 
 CAMERA_SECTIONS: tuple[CameraRole, ...] = ("star_camera", "reflector_camera")
+"""Of the cameras that records come from."""
+ALL_CAMERA_SECTIONS: tuple[CameraRole, ...] = (*CAMERA_SECTIONS, "psf_camera")
 MAX_REPORTED_PROBLEMS = 40  # a wrong unit in a list of 1000 facets needs no 1000 lines
 SAME_ANGLE_DECIMALS = 12  # of a degree: takes the rounding of deg -> rad -> deg away
 
@@ -78,8 +80,8 @@ class InstrumentConfig(InstrumentSections):
         buses = config.actuators.buses if config.actuators is not None else ()
         if any(isinstance(bus.drive_map, str) for bus in buses):
             raise ConfigError(f"{source}: actuators: the stored config must hold its register maps written out")
-        for name in CAMERA_SECTIONS:
-            if any(isinstance(named, str) for named in getattr(config, name).calibrations or ()):
+        for name in ALL_CAMERA_SECTIONS:
+            if any(isinstance(named, str) for named in getattr(getattr(config, name), "calibrations", None) or ()):
                 raise ConfigError(f"{source}: {name}: the stored config must hold its calibrations written out")
         _raise_together(contradictions(config, cls.model_fields.keys(), source))
         return config
@@ -141,7 +143,7 @@ def load_config(name_or_path: str | Path, *, has_map: bool = True, now: datetime
         except ConfigError as problem:
             problems.append(str(problem))
             known.discard(name)
-    for name in CAMERA_SECTIONS:
+    for name in ALL_CAMERA_SECTIONS:
         if name in known and getattr(config, name) is not None:
             camera = with_whole_folder(getattr(config, name), path.parent)
             try:
@@ -154,7 +156,7 @@ def load_config(name_or_path: str | Path, *, has_map: bool = True, now: datetime
     moment = now or SystemClock().now()
     problems += [
         f"{source}: {name}.calibrations: {problem}"
-        for name in CAMERA_SECTIONS
+        for name in ALL_CAMERA_SECTIONS
         if name in known and getattr(config, name) is not None
         for problem in calibration_problems(getattr(config, name), name, moment)
     ]

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from namod_ctl.app.config.calibrations import calibrated, calibrations_of
+from namod_ctl.app.config.psf_camera_schema import PsfCameraSection
 from namod_ctl.app.config.schema import (
     FacetSection,
     LegsMountSection,
@@ -62,6 +63,24 @@ def mount_of(section: TripodMountSection | LegsMountSection, orientation_deg: fl
         turn_raises_leg=section.turn_raises_leg or "clockwise",
         base_joints_m=base_joints_m,
     )
+
+
+def psf_camera_of(section: PsfCameraSection) -> CameraModel:
+    """The PSF camera, by its calibrations where it has any; the middle of its image stands for the telescope's axis."""
+    law = section.radiometric_law
+    camera = CameraModel(
+        name=section.model,
+        n_columns=section.columns,
+        n_rows=section.rows,
+        plate_scale_rad=mdeg_to_rad(section.plate_scale_mdeg_per_px),
+        axis_pixel=np.array([section.columns / 2.0, section.rows / 2.0]),
+        axis_is_calibrated=False,
+        orientation=CameraOrientation(),
+        law=RadiometricLaw(1.0, -1.0, 0.0) if law is None else RadiometricLaw(law.r_resp, law.r_expo, law.r_const),
+        full_scale_adu=section.full_scale_adu,
+        saturation_share=section.saturation_share,
+    )
+    return calibrated(camera, calibrations_of(section))
 
 
 def camera_of(section: StarCameraSection | ReflectorCameraSection) -> CameraModel:

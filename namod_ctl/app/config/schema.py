@@ -10,8 +10,8 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from namod_ctl.app.config.actuator_schema import ActuatorsSection
-from namod_ctl.app.config.calibration_schema import Calibration
-from namod_ctl.app.config.camera_schema import DeviceSection
+from namod_ctl.app.config.camera_schema import DeviceCameraSection, RadiometricLawSection
+from namod_ctl.app.config.psf_camera_schema import PsfCameraSection
 from namod_ctl.app.config.section import FacetId, FileName, Name, Section, within
 
 AngleDeg = Annotated[float, within(-360.0, 360.0)]
@@ -151,35 +151,6 @@ class LegsMountSection(_MountSection):
 MountSection = Annotated[TripodMountSection | LegsMountSection, Field(discriminator="kind")]
 
 
-class RadiometricLawSection(Section):
-    """log10(I) = r_resp log10(C) + r_expo log10(T in s) + r_const, C the response as a share of full scale."""
-
-    r_resp: Annotated[float, within(0.2, 5.0)]
-    r_expo: Annotated[float, within(-3.0, -0.2)]
-    r_const: Annotated[float, within(-10.0, 10.0)]
-
-
-AcceptedCalibration = Literal["expired", "foreign"]
-
-
-class DeviceCameraSection(Section):
-    """What any camera has.
-
-    `calibrations` are files, or written out; what they hold takes the place of what stands here.
-    `accept_calibrations` lets those pass that are expired, or foreign: of another camera by their serial number.
-    """
-
-    model: Name
-    serial_number: Name | None = None
-    columns: Annotated[int, within(64, 20_000)]
-    rows: Annotated[int, within(64, 20_000)]
-    full_scale_adu: Annotated[float, within(1.0, 65_535.0)]
-    saturation_share: Annotated[float, within(0.5, 1.0)]
-    device: DeviceSection | None = None
-    calibrations: Annotated[tuple[FileName | Calibration, ...] | None, Field(strict=False)] = None
-    accept_calibrations: Annotated[tuple[AcceptedCalibration, ...] | None, Field(strict=False)] = None
-
-
 class _CameraSection(DeviceCameraSection):
     """What both cameras of the method have."""
 
@@ -275,4 +246,5 @@ class InstrumentSections(Section):
     reflector_camera: ReflectorCameraSection
     reflector_map: ReflectorMapSection | None = None
     recording: RecordingSection | None = None
+    psf_camera: PsfCameraSection | None = None
     actuators: ActuatorsSection | None = None

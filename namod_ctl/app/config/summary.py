@@ -10,7 +10,10 @@ from numpy.typing import NDArray
 
 from namod_ctl.app.config.actuator_summary import actuator_rows, actuator_warnings
 from namod_ctl.app.config.calibrations import calibrations_of
+from namod_ctl.app.config.camera_schema import DeviceCameraSection
 from namod_ctl.app.config.instrument import InstrumentConfig
+from namod_ctl.app.config.parts import psf_camera_of
+from namod_ctl.app.config.psf_camera_schema import PsfCameraSection
 from namod_ctl.app.config.schema import LegsMountSection, ReflectorCameraSection, StarCameraSection, TripodMountSection
 from namod_ctl.app.views.number_ranges import runs_in_words
 from namod_ctl.core.units import m2_to_cm2, rad_to_deg, rad_to_mdeg
@@ -19,6 +22,8 @@ from namod_ctl.optics.instrument import Instrument
 from namod_ctl.optics.layouts import facet_area_m2, facet_outline_m
 
 COMMON_FOCAL_RATIOS = (0.8, 2.5)
+LEAST_PSF_VIEW_DEG = 0.4
+"""Along the shorter edge: FACT's light fell 12 arcmin from its centre before it was aligned."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,12 +36,14 @@ class Summary:
 
 def summarize(config: InstrumentConfig, instrument: Instrument) -> list[Summary]:
     """What the config says, one summary per part of the telescope."""
+    psf_camera = [] if config.psf_camera is None else [Summary("\nPSF camera", _psf_camera_rows(config.psf_camera))]
     return [
         Summary(f"Telescope {config.telescope.name}", _telescope_rows(config, instrument)),
         Summary("\nMounts", _mount_rows(config, instrument)),
         Summary("\nActuators", actuator_rows(config)),
         Summary("\nStar camera", _camera_rows(config.star_camera, instrument.star_camera)),
         Summary("\nReflector camera", _camera_rows(config.reflector_camera, instrument.reflector_camera)),
+        *psf_camera,
         Summary("\nMap of facets", _map_rows(instrument)),
     ]
 
@@ -69,6 +76,13 @@ def warnings_of(config: InstrumentConfig, instrument: Instrument) -> list[str]:
             f"{without[0]} has no device, the other camera has one: nothing can be recorded on a sky before "
             f"[{without[0]}.device] says which camera it is"
         )
+    if config.psf_camera is not None:
+        screen_deg = _view_deg(psf_camera_of(config.psf_camera))
+        if min(screen_deg) < LEAST_PSF_VIEW_DEG:
+            warnings.append(
+                f"the PSF camera sees {screen_deg[0]:.2f} x {screen_deg[1]:.2f} deg of the focal plane: the spot of a "
+                f"misaligned mirror and sky around it need {LEAST_PSF_VIEW_DEG:g} deg"
+            )
     return warnings + actuator_warnings(config)
 
 
@@ -126,9 +140,25 @@ def _legs_in_words(section: LegsMountSection) -> str:
     return f"{len(section.positions_m)} {inclined} legs at (x, y) = {places} m{turned}{fixed}"
 
 
+def _psf_camera_rows(section: PsfCameraSection) -> tuple[tuple[str, str], ...]:
+    """As for the other cameras, less what has no meaning for this one."""
+    rows = _common_rows(section, psf_camera_of(section))
+    return (*rows, ("used by align", f"{section.n_frames} frames, from {section.exposure_s:g} s on"))
+
+
 def _camera_rows(
     section: StarCameraSection | ReflectorCameraSection, camera: CameraModel
 ) -> tuple[tuple[str, str], ...]:
+    rows = [*_common_rows(section, camera), ("orientation", _orientation_in_words(camera))]
+    if isinstance(section, StarCameraSection):
+        x_px, y_px = camera.axis_pixel
+        known = "calibrated" if camera.axis_is_calibrated else "not calibrated, nominal centre of the image"
+        rows.append(("optical axis", f"at column {x_px:g}, row {y_px:g} ({known})"))
+        rows.append(("star", f"{section.star_diameter_deg:g} deg across"))
+    return tuple(rows)
+
+
+def _common_rows(section: DeviceCameraSection, camera: CameraModel) -> list[tuple[str, str]]:
     law = camera.law
     curve = f" {law.r_curve:+g} (log10 C)^2" if law.r_curve else ""
     width_deg, height_deg = _view_deg(camera)
@@ -140,22 +170,16 @@ def _camera_rows(
         ("saturated from", f"{camera.saturation_share:.0%} of full scale"),
         ("plate scale", f"{rad_to_mdeg(camera.plate_scale_rad):.6g} mdeg per px"),
         ("field of view", f"{width_deg:.2f} x {height_deg:.2f} deg"),
-        ("orientation", _orientation_in_words(camera)),
         ("radiometric law", f"log10 I = {law.r_resp:g} log10 C{curve} {law.r_expo:+g} log10 (T/s) {law.r_const:+g}"),
     ]
     rows += [
         ("calibration", f"{calibration.kind}, of {calibration.made_utc}, valid until {calibration.valid_until_utc}")
         for calibration in calibrations_of(section)
     ]
-    if isinstance(section, StarCameraSection):
-        x_px, y_px = camera.axis_pixel
-        known = "calibrated" if camera.axis_is_calibrated else "not calibrated, nominal centre of the image"
-        rows.append(("optical axis", f"at column {x_px:g}, row {y_px:g} ({known})"))
-        rows.append(("star", f"{section.star_diameter_deg:g} deg across"))
-    return tuple(rows)
+    return rows
 
 
-def _device_in_words(section: StarCameraSection | ReflectorCameraSection) -> str:
+def _device_in_words(section: DeviceCameraSection) -> str:
     """By what the camera is found, for a person who looks for it."""
     device = section.device
     if device is None:

@@ -20,6 +20,7 @@ _KINDS = {
     "done": "marked as done",
     "control": "a request could not be understood",
     "undone_in": "a correction was taken back",
+    "psf_check": "looked through the PSF camera",
 }
 _TROUBLE_KINDS = frozenset({"check", "finding", "refused", "control", "undone_in"})
 _TROUBLE_TRIGGERS = frozenset({"poor_data", "undo", "hold", "fail", "changed", "release"})

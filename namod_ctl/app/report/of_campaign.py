@@ -37,12 +37,14 @@ from namod_ctl.core.errors import DataQualityError
 from namod_ctl.core.records import Record
 from namod_ctl.core.units import rad2_to_arcmin2, rad_to_arcmin
 from namod_ctl.cycle.machine import STATES
+from namod_ctl.cycle.psf_check import AGREE_SIGMAS
+from namod_ctl.cycle.psf_check import EVENT as PSF_CHECK
 from namod_ctl.optics.instrument import Instrument
 from namod_ctl.reconstruction.alignment import Alignment, AreaOfPsf
 from namod_ctl.reconstruction.reconstruct import Reconstruction, reconstruct
 from namod_ctl.reconstruction.responses import tabulate_responses
 from namod_ctl.store.campaign import CampaignStore
-from namod_ctl.store.campaign_rows import Cycle
+from namod_ctl.store.campaign_rows import Cycle, Event
 from namod_ctl.store.folders import is_run
 from namod_ctl.store.run import RunStore
 
@@ -58,7 +60,7 @@ def campaign_report(path: Path) -> tuple[Document, Mapping[str, bytes]]:
         shown = measured[:1] + measured[-1:] if len(measured) > 1 else measured
         results = _reconstructions(shown, runs, instrument)
         alignments = {cycle.number: _alignment(cycle) for cycle in measured}
-        chapters = [_result(measured, results, instrument), _done(store, origin)]
+        chapters = [_result(measured, results, instrument, store.events()), _done(store, origin)]
         chapters += [journal_chapter(store.events()), fault_chapter(store)]
         chapters += motion_chapters(store, instrument, alignments)
         if shown:
@@ -114,7 +116,12 @@ def _alignment(cycle: Cycle) -> Alignment:
     return alignment_from_json(cycle.alignment_json or "", _name(cycle.number))
 
 
-def _result(measured: Sequence[Cycle], results: Mapping[int, Reconstruction], instrument: Instrument) -> Chapter:
+def _result(
+    measured: Sequence[Cycle],
+    results: Mapping[int, Reconstruction],
+    instrument: Instrument,
+    events: Sequence[Event],
+) -> Chapter:
     if not measured:
         return Chapter("Result", (Text("There is none yet: no cycle has been reconstructed.", is_warning=True),))
     first, last = measured[0], measured[-1]
@@ -144,16 +151,43 @@ def _result(measured: Sequence[Cycle], results: Mapping[int, Reconstruction], in
         Table(("whole reflector", "A_sigma arcmin²", "times the limit"), rows),
         Table(head, cycles, frozenset({4})),
         Picture(
-            compact_png(draw_history(list(measured), instrument.name)),
+            compact_png(draw_history(list(measured), instrument.name, events)),
             "A_sigma of every cycle as measured and as predicted by the cycle before; broken line: ray-traced limit "
             "of mirrors without errors.",
         ),
     ]
+    blocks += _psf_checks(events)
     if results:
         panels = measured_panels(list(results.values()), [f"measured in {_name(number)}" for number in results])
         picture = draw_psf_sum(panels, instrument.name, list(results.values())[-1].limit)
         blocks.append(Picture(compact_png(picture), "Light of the whole reflector as measured; ellipses: A_sigma."))
     return Chapter("Result", tuple(blocks))
+
+
+def _psf_checks(events: Sequence[Event]) -> list[Block]:
+    """What the PSF camera saw beside the estimates of those moments; nothing without one."""
+    rows = []
+    for event in events:
+        if event.kind != PSF_CHECK:
+            continue
+        if not event.data.get("is_measured"):
+            rows.append((str(event.data.get("when")), "not measured", "–", "–", event.text))
+            continue
+        seen, estimate = (
+            area_text(AreaOfPsf(float(str(event.data[area])), float(str(event.data[doubt]))))
+            if area in event.data
+            else "–"
+            for area, doubt in (("a_sigma_rad2", "uncertainty_rad2"), ("estimate_rad2", "estimate_uncertainty_rad2"))
+        )
+        apart = event.data.get("difference_sigmas")
+        verdict = "nothing to compare with"
+        if apart is not None:
+            verdict = "they agree" if abs(float(str(apart))) <= AGREE_SIGMAS else "they do NOT agree: " + event.text
+        rows.append((str(event.data["when"]), seen, estimate, str(event.data.get("cycle", "–")), verdict))
+    if not rows:
+        return []
+    head = ("PSF camera", "A_sigma seen arcmin²", "A_sigma estimated arcmin²", "in cycle", "")
+    return [Text("An independent look at the light of the whole mirror:"), Table(head, tuple(rows), frozenset({4}))]
 
 
 def _done(store: CampaignStore, origin: Origin) -> Chapter:

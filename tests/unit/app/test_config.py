@@ -221,7 +221,7 @@ def test_facets_come_from_a_sim_telarray_list_and_stand_on_the_dish(tmp_path: Pa
     rows = "60.0 0.0 60.6 488.9 3 #% id=8\n-80.0 60.0 60.6 0 1 12.5 #% id=9\n"
     first, second = _load_with_list(tmp_path, 'format = "sim_telarray"', rows).facets
     assert (first.id, second.id) == (8, 9)
-    assert first.rotation_deg == 30.0
+    assert first.rotation_deg == 0.0  # its frame is turned by 90 deg against ours
     assert first.position_m[2] == pytest.approx(4.889 - np.sqrt(4.889**2 - 0.6**2))  # Davies-Cotton unless told
     assert second.position_m[2] == 0.125
     dish = 'format = "sim_telarray"\n[reflector.dish]\nparabola_share = 1.0'

@@ -97,9 +97,11 @@ def test_sim_telarray_rows_with_and_without_z_and_id() -> None:
     ).facets
     assert [facet.id for facet in facets] == [5, 6]
     assert facets[0].position_m[2] == pytest.approx(1.54**2 / 112.0)  # on the paraboloid z = r^2 / (4 f)
-    assert facets[0].rotation_rad == 0.0  # code 1: flats parallel to y
+    np.testing.assert_allclose(facets[0].position_m[:2], [0.0, -1.54])  # their +x points down
+    assert facets[0].rotation_rad == pytest.approx(np.pi / 6)  # code 1: flats face their +-x, which is up and down
     assert facets[1].position_m[2] == pytest.approx(0.119)
-    assert facets[1].rotation_rad == pytest.approx(np.pi / 6)
+    np.testing.assert_allclose(facets[1].position_m[:2], [0.005, 0.77])
+    assert facets[1].rotation_rad == 0.0
     assert facets[1].focal_length_m == pytest.approx(np.hypot(np.hypot(0.77, 0.005), 28.0 - 0.119))
 
 
@@ -135,7 +137,7 @@ def test_a_written_sim_telarray_row_has_z_before_the_id() -> None:
     facet = Facet(42, np.array([1.0, -2.0, 0.25]), 16.0, FacetShape.SQUARE, 1.2)
     row = format_sim_telarray(Reflector(16.0, (facet,))).splitlines()[-1]
     values, _, identity = row.partition("#%")
-    assert [float(value) for value in values.split()] == [100.0, -200.0, 120.0, 1600.0, 2.0, 25.0]
+    assert [float(value) for value in values.split()] == [200.0, 100.0, 120.0, 1600.0, 2.0, 25.0]
     assert identity.strip() == "id=42"
 
 
@@ -143,6 +145,16 @@ def test_a_turn_without_a_code_is_refused() -> None:
     facet = Facet(42, np.array([1.0, -2.0, 0.25]), 16.0, FacetShape.HEXAGON, 1.2, rotation_rad=0.2)
     with pytest.raises(ConfigError, match=r"facet 42.*no code"):
         format_sim_telarray(Reflector(16.0, (facet,)))
+
+
+def test_a_facet_below_the_vertex_is_refused_and_one_at_its_height_keeps_a_z() -> None:
+    def facet(z_m: float) -> Facet:
+        return Facet(42, np.array([1.0, -2.0, z_m]), 16.0, FacetShape.ROUND, 1.2)
+
+    with pytest.raises(ConfigError, match=r"facet 42.*2\.000 cm below"):
+        format_sim_telarray(Reflector(16.0, (facet(-0.02),)))
+    row = format_sim_telarray(Reflector(16.0, (facet(0.0),))).splitlines()[-1]
+    assert float(row.split()[5]) > 0.0  # a 0 would ask sim_telarray to put it on the dish
 
 
 def test_missing_and_binary_files_are_named(tmp_path: Path) -> None:

@@ -9,6 +9,13 @@ from namod_ctl.app.lazy_commands import MARKUP, LazyCommands
 _ROOM = "namod_ctl.app.commands.calibrate"
 
 _COMMANDS = {
+    "dark": f"{_ROOM}.dark:dark",
+    "radiometric": f"{_ROOM}.radiometric:radiometric",
+    "normalization": f"{_ROOM}.normalization:normalization",
+    "star-field": f"{_ROOM}.star_field:star_field",
+    "trail": f"{_ROOM}.trail:trail",
+    "chessboard": f"{_ROOM}.chessboard:chessboard",
+    "axis": f"{_ROOM}.axis:axis",
     "show": f"{_ROOM}.show:show",
 }
 

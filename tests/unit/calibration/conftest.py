@@ -1,0 +1,8 @@
+"""The made runs of reconstruction serve here."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+sys.path.append(str(Path(__file__).parents[1] / "reconstruction"))
