@@ -6,9 +6,9 @@ The slope put in is 0 or the paper's, -6.9 % per magnitude (arXiv:1605.06274, se
 generator of the tests, which throws rays; twin nights go through exposure loop, images, and measurement. There the law
 of the reflector camera's exposures is wrong, so the true slope of each night is worked out from the exposures it had:
 the same records with the wrong law divided out are measured again. Columns: `error` (rms over seeds) and `stated`
-uncertainty of the measured slope; what the self-calibration `left` of the true slope (rms, and the worst seed); by how
-much it `moved` the facets' centres (rms, and the most any facet moved) in their uncertainties per axis; and the centres'
-errors against the truth with the self-calibration off and on, arcmin rms per axis.
+uncertainty of the measured slope; what the self-calibration `left` of the true slope (rms, and the worst seed); by
+how much it `moved` the facets' centres (rms, and the most any facet moved) in their uncertainties per axis; and the
+centres' errors against the truth with the self-calibration off and on, arcmin rms per axis.
 """
 
 from __future__ import annotations
@@ -147,6 +147,8 @@ def twin_night(seed: int, n_records: int, sky: str, law_error: float) -> Night |
 
 def print_row(title: str, n_records: int, nights: list[Night | None]) -> None:
     known = [night for night in nights if night is not None]
+    if not nights:
+        return
     if not known:
         print(f"{title:17s}{n_records:8d}{0:4d}/{len(nights):<3d}  too little information")
         return

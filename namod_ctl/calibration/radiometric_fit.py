@@ -31,6 +31,12 @@ UNSEEN_SHARE = 0.25
 RELATIVE_STEP = 0.01
 LEAST_FREEDOM = 4.0
 N_ITERATIONS = 5
+UNTUNED = 1e-3
+"""Change of a term after which the deviations are sought anew."""
+
+SETTLED = 1e-6
+"""Change of a term that is no change: standard errors are a hundred times as large at the least."""
+
 TWO_SIGMA = 0.97725
 """Share of a normal distribution below two standard deviations."""
 
@@ -155,14 +161,15 @@ def fit_law(data: LampData, form: LawForm) -> LawFit:
     """The law that fits the visits best; needs more visits than terms and two levels."""
     problem = _Problem(data, form)
     theta = _start(data, form)
-    deviations = np.array([1e-3, 1e-3])
+    deviations, moved = np.array([1e-3, 1e-3]), np.inf
     for _ in range(N_ITERATIONS):
         problem.predict_by(theta)
-        deviations = problem.likeliest_deviations(deviations)
+        if moved > UNTUNED:
+            deviations = problem.likeliest_deviations(deviations)
         new, _ = problem.solve(deviations)
-        is_settled = bool(np.all(np.abs(new - theta) < 1e-9))
+        moved = float(np.abs(new - theta).max())
         theta = new
-        if is_settled:
+        if moved < SETTLED:
             break
     problem.predict_by(theta)
     return problem.judged(deviations)

@@ -20,6 +20,8 @@ from namod_ctl.core.units import deg_to_rad, m_to_mm, rad_to_deg
 from namod_ctl.cycle.leg_course import refusal
 from namod_ctl.store.campaign import CampaignStore
 
+NOTE_JOURNAL = "lut.journal"
+"""Holds what moves: "twin" or "telescope"; campaigns that are no journal have no such note."""
 NOTE_BASELINE = "lut.baseline"
 NOTE_APPLIED = "lut.applied"
 

@@ -183,9 +183,8 @@ class _Spot:
             minor, major = np.linalg.eigvalsh(found.covariance_px2)
             if not minor >= MIN_SIGMA_PX**2:
                 raise DataQualityError(
-                    f"the spot is {np.sqrt(max(minor, 0.0)):.1f} pixels wide (one standard deviation), less than "
-                    f"{MIN_SIGMA_PX:g}: too sharp, or too faint, for this camera; take a finer plate scale, or expose "
-                    "longer"
+                    f"the spot is less than {MIN_SIGMA_PX:g} pixels wide (one standard deviation): too sharp, or too "
+                    "faint, for this camera; take a finer plate scale, or expose longer"
                 )
             shape = self._wings.shape_px2
             change = np.sqrt(minor * major / np.linalg.det(self._wings.covariance_px2)) - 1.0

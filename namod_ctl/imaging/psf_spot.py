@@ -36,6 +36,8 @@ SMOOTHING_OF_SPOT = 0.3
 FOUND_SIGMAS = 6.0
 FOUND_SHARE = 0.004
 """Of the peak: a gaussian's edge at 3.3 standard deviations. Fainter light is left to the growth of the aperture."""
+LEAST_DITHER_ADU = 0.35
+"""Noise below does not hide the steps of whole numbers."""
 GAP_RADII = 1.0
 """Gaps between the pieces of one spot, in root mean square radii of what belongs to it."""
 MAX_OTHER_SHARE = 0.3
@@ -253,11 +255,14 @@ def _pieces(excess: Array, width_px: float) -> tuple[Array, NDArray[np.int32]]:
     """The light, smoothed, and pieces of the image that shine, numbered from 1. Raises DataQualityError for none."""
     smooth = np.asarray(cv2.GaussianBlur(excess.astype(np.float32), (0, 0), width_px), dtype=np.float64)
     # white noise, smoothed; what is left of an uneven sky counts as well
-    spread = noise_of(excess) / (2.0 * np.sqrt(np.pi) * width_px)
+    noise = noise_of(excess)
+    spread = noise / (2.0 * np.sqrt(np.pi) * width_px)
     quiet = smooth[np.abs(smooth) < 10.0 * spread]
     if quiet.size > smooth.size // 4:
         spread = max(spread, 1.4826 * float(np.median(np.abs(quiet))))
     threshold = max(FOUND_SIGMAS * spread, FOUND_SHARE * float(smooth.max()))
+    if noise < LEAST_DITHER_ADU:  # a sky that rises from one whole number to the next shows a step
+        threshold = max(threshold, 1.0)
     n, groups = cv2.connectedComponents((smooth > threshold).astype(np.uint8), connectivity=8)
     if n < 2:
         raise DataQualityError(

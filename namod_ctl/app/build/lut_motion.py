@@ -24,15 +24,13 @@ from namod_ctl.cycle.control import ControlBox, RequestKind
 from namod_ctl.cycle.correct import StopAsked
 from namod_ctl.cycle.correct_by_motor import MotorCorrector
 from namod_ctl.cycle.mover import Mover
+from namod_ctl.cycle.table_move import NOTE_JOURNAL
 from namod_ctl.optics.instrument import Instrument
 from namod_ctl.store.campaign import CampaignStore
 from namod_ctl.store.campaign_database import is_campaign
 from namod_ctl.twin.settings import TwinSettings
 from namod_ctl.twin.twin import Twin
 from namod_ctl.twin.world import open_world
-
-NOTE_JOURNAL = "lut.journal"
-"""Holds what moves: "twin" or "telescope"; campaigns that are no journal have no such note."""
 
 
 @dataclass(frozen=True, slots=True)

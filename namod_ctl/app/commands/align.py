@@ -32,6 +32,7 @@ from namod_ctl.cycle.campaign import Campaign
 from namod_ctl.cycle.campaign_parts import CampaignSettings
 from namod_ctl.cycle.machine import FINAL
 from namod_ctl.cycle.record import RecordSettings
+from namod_ctl.cycle.table_move import NOTE_JOURNAL
 from namod_ctl.store.campaign import CampaignStore
 from namod_ctl.store.folders import check_output
 from namod_ctl.store.import_namod import KeepFrames
@@ -194,6 +195,10 @@ def _what_is_aligned(start: _Start) -> str:
 def _resumed(stack: ExitStack, path: Path) -> _Start:
     store = stack.enter_context(CampaignStore.open(path, read_only=False))
     twin = noted_twin(store)
+    if store.note(NOTE_JOURNAL) is not None:
+        raise ConfigError(
+            f"{path}: is the journal of a look-up table, no campaign: 'namod-ctl lut apply' goes on with it"
+        )
     if twin is None and store.last_state() is None:
         # whether it was to be the twin or the telescope itself nobody can tell
         raise ConfigError(

@@ -19,6 +19,7 @@ from namod_ctl.core.drives import Leg
 from namod_ctl.core.motion import MoveOutcome
 from namod_ctl.core.units import rad2_to_arcmin2
 from namod_ctl.cycle.machine import FINAL, STATES
+from namod_ctl.cycle.table_move import NOTE_JOURNAL
 from namod_ctl.store.campaign import CampaignStore
 from namod_ctl.store.campaign_lock import running_pid
 from namod_ctl.store.campaign_rows import TRANSITION
@@ -105,6 +106,8 @@ def describe(store: CampaignStore, pid: int | None) -> dict[str, Any]:
 
 
 def _next(store: CampaignStore, state: str, *, is_running: bool) -> str:
+    if not is_running and store.note(NOTE_JOURNAL) is not None:
+        return "nothing: this is the journal of a look-up table, 'namod-ctl lut apply' goes on with it"
     if state == "held":
         return f"somebody looks at the telescope, then 'namod-ctl release {store.path}'"
     if state == "awaiting_operator":

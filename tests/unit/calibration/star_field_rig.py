@@ -9,7 +9,7 @@ import numpy as np
 
 from namod_ctl.app.build.instrument import build_instrument
 from namod_ctl.app.config.instrument import load_config
-from namod_ctl.calibration.observed_sky import Site, julian_year
+from namod_ctl.calibration.observed_sky import Site, julian_year, observed_directions
 from namod_ctl.calibration.star_catalogue import bright_stars
 from namod_ctl.calibration.star_match import known_stars
 from namod_ctl.calibration.star_search import SeenStars
@@ -115,10 +115,14 @@ def foreign_sky(rng):
     )
 
 
-def known_somewhere(rng, radius_deg):
-    """The catalogue's stars within an angle of some place of the sky."""
+def known_somewhere(rng, radius_deg, far_from=None):
+    """The catalogue's stars within an angle of some place of the sky, which is not on the half of `far_from`'s field."""
     directions = CATALOGUE.directions(2026.5)
     near = directions[rng.integers(len(directions))]
+    if far_from is not None:
+        at = observed_directions(CATALOGUE, far_from.watch.moment, SITE)
+        field = directions[np.nanargmax(at @ far_from.direction)]
+        near = -near if near @ field > 0.0 else near
     is_near = directions @ near >= np.cos(deg_to_rad(radius_deg))
     some = np.where(is_near[:, None], directions, np.nan)
     return known_stars(some, CATALOGUE.v_mag, CATALOGUE.is_disturbed, STAR_SIZE_RAD)
