@@ -25,6 +25,7 @@ from namod_ctl.calibration.lamp_series import (
     Response,
     lit_patch,
     measure_response,
+    middle_of,
     patch_dark,
     refuse_wandering,
     unknown_dark,
@@ -129,7 +130,7 @@ def read_stored_series(
     else:
         dark_adu = min(glance.median_adu for glance in glances)
     series.patch = patch = without_hot(
-        _patch(lit, glances, numbers, series, unit, dark_adu, camera.full_scale_adu), darks
+        middle_of(_patch(lit, glances, numbers, series, unit, dark_adu, camera.full_scale_adu)), darks
     )
     n_channels = 1
     for frame, glance, number in zip(lit, glances, numbers, strict=True):

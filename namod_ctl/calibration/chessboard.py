@@ -20,6 +20,7 @@ from namod_ctl.core.errors import DataQualityError
 from namod_ctl.core.units import deg_to_rad, rad_to_deg
 from namod_ctl.imaging.radiometry import Frame
 from namod_ctl.optics.camera_model import CameraModel, Distortion
+from namod_ctl.optics.coordinates import angles_of_direction
 
 Array = NDArray[np.float64]
 
@@ -35,7 +36,7 @@ MAX_RELATIVE_UNCERTAINTY = 0.02
 MAX_CENTRE_UNCERTAINTY_SHARE = 0.05
 """Of the image's width: a centre of distortion that is known worse is taken to be the image's centre."""
 GRID = 41
-FOCAL_X, FOCAL_Y, CENTRE_X, CENTRE_Y, BEND_1, BEND_2 = range(6)
+FOCAL_X, FOCAL_Y, CENTRE_X, CENTRE_Y = range(4)
 _FLAGS = cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3
 _UNBEND = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
 _SEARCH = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
@@ -250,8 +251,8 @@ def _converted(lens: _Lens, camera: CameraModel) -> tuple[CameraModel, float]:
     pixel = np.column_stack([x.ravel(), y.ravel()])
     tangent = cv2.undistortPoints(pixel.reshape(-1, 1, 2), lens.matrix, lens.coefficients, criteria=_UNBEND)
     tangent = np.asarray(tangent, dtype=np.float64).reshape(-1, 2)
-    axes = camera.orientation.image_to_telescope
-    wanted = np.arctan(tangent @ axes.T) @ axes / scale_rad  # straight offsets, pixel
+    ahead = np.concatenate([tangent, np.ones((len(tangent), 1))], axis=1)
+    wanted = angles_of_direction(ahead) / scale_rad  # straight offsets, pixel
     offset = pixel - centre
     angle2 = scale_rad**2 * np.sum(offset**2, axis=1, keepdims=True)
     terms = np.stack([offset * angle2, offset * angle2**2], axis=-1).reshape(-1, 2)

@@ -30,6 +30,7 @@ PATCH_SHARE = 0.6
 """The patch is where the smoothed light has at least this share of its largest."""
 
 MIN_PATCH_PX = 400
+MAX_SIDE_PX = 500
 MIN_PATCH_LIGHT_SHARE = 0.05
 """Of full scale: less light does not tell where the lamp is."""
 
@@ -144,8 +145,22 @@ def lit_patch(image: Image, dark_adu: float, full_scale_adu: float, name: str) -
             f"{name}: the lamp lights only {int(is_inside.sum())} pixels evenly (limit {MIN_PATCH_PX}): a point of "
             "light cannot be used; put a diffuser (white paper) before the lens and let the lamp light it"
         )
+    return _boxed(is_inside)
+
+
+def _boxed(is_inside: NDArray[np.bool_]) -> Patch:
     rows, columns = np.flatnonzero(is_inside.any(axis=1)), np.flatnonzero(is_inside.any(axis=0))
     return Patch(is_inside, (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)))
+
+
+def middle_of(patch: Patch) -> Patch:
+    """The patch, or of a large one the square about its middle: more pixels tell nothing more."""
+    middle = [int(axis.mean()) for axis in np.nonzero(patch.is_inside)]
+    half = MAX_SIDE_PX // 2
+    square = tuple(slice(max(at - half, 0), at + half) for at in middle)
+    inner = np.zeros_like(patch.is_inside)
+    inner[square] = patch.is_inside[square]
+    return _boxed(inner) if int(inner.sum()) >= MIN_PATCH_PX else patch  # a ring has a hole in its middle
 
 
 def without_hot(patch: Patch, darks: Sequence[DarkFrame]) -> Patch:

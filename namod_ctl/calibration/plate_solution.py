@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import f as f_distribution
 
 from namod_ctl.optics.camera_model import CameraModel, Distortion
 
@@ -35,7 +36,12 @@ SECOND_DISTORTION_AT_CORNER = 0.001
 CENTRE_SHARE_OF_WIDTH = 0.01
 """Standard deviation of the lens's centre from the image's: a quarter of a millimetre for sensors of an inch."""
 
-OUTLIER_SIGMAS = 5.0
+SUSPICIOUS_CHI2 = 2.0
+"""Per degree of freedom: above, some star may not be where its errors say."""
+
+DROPPED_BY_CHANCE = 0.01
+"""How often a star is left out of a fit in which nothing is wrong."""
+
 LEAST_ERROR_PX = 0.01
 """No centre of a star is trusted further: pixels are not all alike."""
 
@@ -175,29 +181,36 @@ def fit_plate(
 ) -> PlateFit:
     """The plate that brings stars at `pixel` (n, 2), known to `error_px` (n,), to `directions` (n, 3).
 
-    Least squares, with at most `max_dropped` stars left out one after another as long as the worst one stands more than
-    `OUTLIER_SIGMAS` out. `start` must be right within a tenth of a radian, and in `is_mirrored`.
+    Least squares. When the stars scatter by more than their errors, at most `max_dropped` of them are left out: each
+    time the one without which the others agree best, as long as they then agree so much better as chance would not make
+    it. `start` must be right within a tenth of a radian, and in `is_mirrored`.
     """
     sigma_px = np.hypot(error_px, LEAST_ERROR_PX)
     is_used = np.ones(len(pixel), dtype=np.bool_)
-    plate, covariance, chi2 = _fit(pixel, sigma_px, directions, start, priors)
-    for _ in range(max_dropped + 1):
-        residual = _residual_px(plate, pixel, directions)
-        degrees = max(1, 2 * int(is_used.sum()) - _N_ATTITUDE - 1)
-        spread = max(1.0, _spread(residual[is_used] / sigma_px[is_used, None]))
-        distance = np.where(is_used, np.linalg.norm(residual, axis=1) / sigma_px, 0.0)
-        worst = int(np.argmax(distance))
-        if distance[worst] <= OUTLIER_SIGMAS * spread or int((~is_used).sum()) == max_dropped:
+
+    def fitted(some: NDArray[np.bool_], begin: Plate) -> tuple[Plate, Array, float]:
+        return _fit(pixel[some], sigma_px[some], directions[some], begin, priors)
+
+    plate, covariance, chi2 = fitted(is_used, start)
+    for _ in range(max_dropped):
+        if chi2 <= SUSPICIOUS_CHI2 * _degrees(is_used):
             break
-        is_used[worst] = False
-        plate, covariance, chi2 = _fit(pixel[is_used], sigma_px[is_used], directions[is_used], plate, priors)
-    per_degree = chi2 / degrees
+        without = [is_used & (np.arange(len(pixel)) != number) for number in np.flatnonzero(is_used)]
+        tries = [fitted(some, plate) for some in without]
+        best = int(np.argmin([one[2] for one in tries]))
+        degrees = _degrees(without[best])
+        gain = (chi2 - tries[best][2]) / 2.0 / (tries[best][2] / degrees)
+        if float(f_distribution.sf(gain, 2, degrees)) * len(tries) > DROPPED_BY_CHANCE:
+            break
+        is_used, (plate, covariance, chi2) = without[best], tries[best]
+    per_degree = chi2 / _degrees(is_used)
+    residual = _residual_px(plate, pixel, directions)
     return PlateFit(plate, covariance * max(1.0, per_degree), residual, is_used, per_degree)
 
 
-def _spread(normalized: Array) -> float:
-    """Of normalized residuals, robust against a few that stand out: 1 when the errors are what they are said to be."""
-    return 1.4826 * float(np.median(np.abs(normalized)))
+def _degrees(is_used: NDArray[np.bool_]) -> int:
+    """Of freedom: what is known of the lens beforehand counts as four measurements of its four parameters."""
+    return max(1, 2 * int(is_used.sum()) - _N_ATTITUDE - 1)
 
 
 def _fit(

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +32,9 @@ UNSEEN_SHARE = 0.25
 RELATIVE_STEP = 0.01
 LEAST_FREEDOM = 4.0
 N_ITERATIONS = 5
-UNTUNED = 1e-3
+LOG_DEX_RANGE = (-5.0, 0.0)
+GRID_LOG_DEX = (-4.5, -3.7, -3.0, -2.4, -1.8, -1.2)
+UNTUNED = 1e-4
 """Change of a term after which the deviations are sought anew."""
 
 SETTLED = 1e-6
@@ -161,11 +164,11 @@ def fit_law(data: LampData, form: LawForm) -> LawFit:
     """The law that fits the visits best; needs more visits than terms and two levels."""
     problem = _Problem(data, form)
     theta = _start(data, form)
-    deviations, moved = np.array([1e-3, 1e-3]), np.inf
+    moved = np.inf
     for _ in range(N_ITERATIONS):
         problem.predict_by(theta)
         if moved > UNTUNED:
-            deviations = problem.likeliest_deviations(deviations)
+            deviations = problem.likeliest_deviations()
         new, _ = problem.solve(deviations)
         moved = float(np.abs(new - theta).max())
         theta = new
@@ -273,20 +276,18 @@ class _Problem:
         determinant = float(np.linalg.slogdet(inner)[1]) if is_restricted else 0.0
         return 0.5 * (log_det + determinant + chi2)
 
-    def likeliest_deviations(self, start: Array) -> Array:
+    def likeliest_deviations(self) -> Array:
         """Deviations of visits and placements, in dex, by restricted maximum likelihood."""
-        if not self.is_placement_known:
-            start = np.array([start[0], ASSUMED_PLACEMENT_DEX])
+        n_free = 2 if self.is_placement_known else 1
+        given = np.array([ASSUMED_PLACEMENT_DEX])[: 2 - n_free]
 
         def target(logs: Array) -> float:
-            deviations = np.append(10.0**logs, start[len(logs) :])
-            return self._minus_log_likelihood(deviations, is_restricted=True)
+            return self._minus_log_likelihood(np.append(10.0**logs, given), is_restricted=True)
 
-        n_free = 2 if self.is_placement_known else 1
-        bounds = [(-5.0, 0.0)] * n_free
-        first = np.clip(np.log10(np.maximum(start[:n_free], 1e-4)), -4.0, -0.1)
-        found = minimize(target, first, method="L-BFGS-B", bounds=bounds)
-        deviations = np.append(10.0**found.x, start[n_free:])
+        # From a wrong start the first step of a search is so long that it never comes back: so a grid comes first.
+        starts = [np.array(start) for start in product(GRID_LOG_DEX, repeat=n_free)]
+        found = minimize(target, min(starts, key=target), method="L-BFGS-B", bounds=[LOG_DEX_RANGE] * n_free)
+        deviations = np.append(10.0**found.x, given)
         weight, _, _ = self._inverse(deviations)
         seen_dex = (self.n_placements / float(weight.sum())) ** 0.5
         deviations[1] = max(deviations[1], UNSEEN_SHARE * seen_dex)

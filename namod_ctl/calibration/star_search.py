@@ -58,6 +58,9 @@ FIRST_TOLERANCE_PX, FIRST_TOLERANCE_SHARE = 4.0, 0.012
 TOLERANCES_PX = (8.0, 4.0, 2.0)
 """How far from where the plate says, one fit after the other."""
 
+N_LAST_FITS = 4
+"""With the last tolerance, until the stars stay the same."""
+
 DISTORTION_CELLS = 10.0
 """So many different bends of the lens can be told apart within the last tolerance: each is a try of its own."""
 
@@ -232,29 +235,29 @@ class FieldSearch:
 
     def _refined(self, plate: Plate) -> FieldMatch | None:
         """The plate fitted to all stars it explains, with ever closer limits; None when too few are left."""
-        fit: PlateFit | None = None
         first_px = FIRST_TOLERANCE_PX + FIRST_TOLERANCE_SHARE * 0.5 * float(np.hypot(*self._size_px))
-        for tolerance_px in (first_px, *TOLERANCES_PX):
+        last_px = TOLERANCES_PX[-1]
+        fit: PlateFit | None = None
+        fitted: Indices | None = None
+        for tolerance_px in (first_px, *TOLERANCES_PX, *[last_px] * N_LAST_FITS):
             seen, known = self._pairs(plate, tolerance_px)
             is_exact = self._seen.is_exact[seen] & self._known.is_exact[known]
             if is_exact.sum() < MIN_STARS:
                 return None
+            if fit is not None and fitted is not None and np.array_equal(fitted, seen):
+                return self._judged(seen, known, is_exact, fit) if fit.is_used.sum() >= MIN_STARS else None
             fit = fit_plate(
                 self._seen.pixel[seen[is_exact]],
                 self._seen.error_px[seen[is_exact]],
                 self._known.directions[known[is_exact]],
                 plate,
                 self._priors,
-                max_dropped=int(is_exact.sum()) // 4 if tolerance_px == TOLERANCES_PX[-1] else 0,
+                max_dropped=int(is_exact.sum()) // 4 if tolerance_px == last_px else 0,
             )
-            plate = fit.plate
+            plate, fitted = fit.plate, seen if tolerance_px == last_px else None
             if not 1.0 - SCALE_TOLERANCE < plate.plate_scale_rad / self._camera.plate_scale_rad < 1.0 + SCALE_TOLERANCE:
                 return None
-        seen, known = self._pairs(plate, TOLERANCES_PX[-1])
-        is_exact = self._seen.is_exact[seen] & self._known.is_exact[known]
-        if fit is None or is_exact.sum() != len(fit.is_used) or fit.is_used.sum() < MIN_STARS:
-            return None
-        return self._judged(seen, known, is_exact, fit)
+        return None
 
     def _pairs(self, plate: Plate, tolerance_px: float) -> tuple[Indices, Indices]:
         """Stars of the frame and of the sky that the plate brings together, one to one; doubtful ones are left out."""

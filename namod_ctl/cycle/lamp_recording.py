@@ -21,6 +21,7 @@ from namod_ctl.calibration.lamp_series import (
     Response,
     lit_patch,
     measure_response,
+    middle_of,
     patch_dark,
     refuse_wandering,
     without_hot,
@@ -153,7 +154,7 @@ def record_lamp_series(
             continue
         here = lit_patch(top.image, dark_adu, full_scale_adu, placement.words)
         if series.patch is None:
-            series.patch = without_hot(here, darks)
+            series.patch = without_hot(middle_of(here), darks)
             series.dark = patch_dark(darks, series.patch)
         refuse_wandering(series.patch, here, placement)
         exposures = _exposures(

@@ -15,7 +15,7 @@ from scipy.stats import chi2
 
 from namod_ctl.core.units import rad2_to_arcmin2, rad_to_arcmin
 from namod_ctl.imaging.psf_aperture import NUMBERS
-from namod_ctl.imaging.psf_image import UNEVENNESS_SHARE, ImagePsf, area_of, area_variance
+from namod_ctl.imaging.psf_image import UNEVENNESS_SHARE, ZERO_SHARE_WORTH_A_WORD, ImagePsf, area_of, area_variance
 
 Array = NDArray[np.float64]
 
@@ -26,7 +26,6 @@ SMEAR_UNCERTAINTY_SHARE = 0.5
 LEAST_CHANCE = 0.003
 """Scatter between images that has less chance by their uncertainties is remarked."""
 MAX_OTHER_SHARE = 0.01
-ZERO_SHARE_WORTH_A_WORD = 0.02
 MISFIT_WORTH_A_WORD = 5.0
 
 

@@ -42,6 +42,8 @@ MIN_SIGMA_PX = 1.2
 MAX_UNCERTAINTY_SHARE = 0.25
 UNEVENNESS_SHARE = 0.003
 """Of A_sigma: no screen is so even, and no camera so linear, that it would be known better."""
+ZERO_SHARE_WORTH_A_WORD = 0.02
+"""Of the sky's pixels: with more of them at 0 the camera's black level is too low."""
 LEAST_NOISE_ADU = 0.2
 PIXELS_PER_SIGMA = 8.0
 """Finer pixels are taken together: what that adds to the moments is known."""
@@ -128,10 +130,12 @@ def measure_psf(frame: Frame, camera: CameraModel, exposure_s: float) -> ImagePs
             result = narrow
     share = result.uncertainty_px2 / result.a_sigma_px2
     if not share <= MAX_UNCERTAINTY_SHARE:
+        remedy = "expose longer, take a brighter star, or darken the screen's surroundings"
+        if result.background.zero_share > ZERO_SHARE_WORTH_A_WORD:
+            remedy = "the sky's noise is cut off at 0 ADU: raise the camera's black level"
         raise DataQualityError(
             f"too faint for this background: A_sigma would be uncertain by {share:.0%}, at most "
-            f"{MAX_UNCERTAINTY_SHARE:.0%} mean anything; expose longer, take a brighter star, or darken the screen's "
-            "surroundings"
+            f"{MAX_UNCERTAINTY_SHARE:.0%} mean anything; {remedy}"
         )
     return result
 

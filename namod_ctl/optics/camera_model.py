@@ -7,7 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from namod_ctl.optics.coordinates import CameraOrientation, pixel_to_theta, theta_to_pixel
+from namod_ctl.optics.coordinates import (
+    CameraOrientation,
+    angles_of_direction,
+    direction_at_angles,
+    direction_to_star,
+    pixel_to_theta,
+    rotation_to_normal,
+    theta_of_direction,
+    theta_to_pixel,
+)
 
 Array = NDArray[np.float64]
 
@@ -35,8 +44,8 @@ class RadiometricLaw:
 class Distortion:
     """How a lens departs from an angle that grows linearly with the distance in the image.
 
-    A pixel at the offset v from `centre_pixel` stands where, without distortion, the offset
-    v (1 + k1 a**2 + k2 a**4) would be, with a the plate scale times the length of v, rad.
+    A pixel at the offset v from `centre_pixel` stands at the angle a (1 + k1 a**2 + k2 a**4) from the lens's axis, on
+    the side of v, with a the plate scale times the length of v, rad.
 
     Attributes
     ----------
@@ -128,17 +137,30 @@ class CameraModel:
     dark: DarkModel | None = None
 
     def theta_of_pixel(self, pixel: Array) -> Array:
-        """Direction in the telescope frame, rad, shape (..., 2), of image positions (x, y) of shape (..., 2)."""
-        straight = pixel if self.distortion is None else self.distortion.straightened(pixel, self.plate_scale_rad)
-        return pixel_to_theta(straight, self._straight_axis_pixel, self.plate_scale_rad, self.orientation)
+        """Direction in the telescope frame, rad, shape (..., 2), of image positions (x, y) of shape (..., 2).
+
+        With a known distortion the lens is round and looks at a sphere; without, angles are counted along x and y, as
+        the field's star cameras are calibrated. On the axis the two are the same.
+        """
+        if self.distortion is None:
+            return pixel_to_theta(pixel, self.axis_pixel, self.plate_scale_rad, self.orientation)
+        to_telescope = rotation_to_normal(self._direction_in_lens(self.axis_pixel))
+        return theta_of_direction(self._direction_in_lens(pixel) @ to_telescope)
 
     def pixel_of_theta(self, theta_rad: Array) -> Array:
         """Image position (x, y), shape (..., 2), of directions in the telescope frame, rad, shape (..., 2)."""
-        straight = theta_to_pixel(theta_rad, self._straight_axis_pixel, self.plate_scale_rad, self.orientation)
-        return straight if self.distortion is None else self.distortion.distorted(straight, self.plate_scale_rad)
+        bend = self.distortion
+        if bend is None:
+            return theta_to_pixel(theta_rad, self.axis_pixel, self.plate_scale_rad, self.orientation)
+        to_telescope = rotation_to_normal(self._direction_in_lens(self.axis_pixel))
+        angles_rad = angles_of_direction(direction_to_star(np.asarray(theta_rad)) @ to_telescope.T)
+        straight = theta_to_pixel(angles_rad, bend.centre_pixel, self.plate_scale_rad, self.orientation)
+        return bend.distorted(straight, self.plate_scale_rad)
 
-    @property
-    def _straight_axis_pixel(self) -> Array:
-        if self.distortion is None:
-            return self.axis_pixel
-        return self.distortion.straightened(self.axis_pixel, self.plate_scale_rad)
+    def _direction_in_lens(self, pixel: Array) -> Array:
+        """Unit vectors (..., 3) from the lens, whose axis is z, with the telescope's x and y for side."""
+        assert self.distortion is not None
+        straight = self.distortion.straightened(pixel, self.plate_scale_rad)
+        return direction_at_angles(
+            pixel_to_theta(straight, self.distortion.centre_pixel, self.plate_scale_rad, self.orientation)
+        )

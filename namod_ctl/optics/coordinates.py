@@ -85,6 +85,30 @@ def direction_to_star(theta_rad: Array) -> Array:
     return unit
 
 
+def theta_of_direction(direction: Array) -> Array:
+    """Theta (..., 2), rad, of vectors (..., 3) of any length in the telescope frame: the inverse of the above."""
+    theta: Array = np.arctan2(direction[..., :2], direction[..., 2:])
+    return theta
+
+
+def direction_at_angles(angles_rad: Array) -> Array:
+    """Unit vectors (..., 3) that stand at the angle |angles| from +z, on the side of `angles_rad` (..., 2).
+
+    So a round lens sees: the angle from its axis, and the side of the axis. Theta counts along x and y apart.
+    """
+    angle = np.linalg.norm(angles_rad, axis=-1, keepdims=True)
+    return np.concatenate([np.sinc(angle / np.pi) * angles_rad, np.cos(angle)], axis=-1)
+
+
+def angles_of_direction(direction: Array) -> Array:
+    """Angles (..., 2), rad, of vectors (..., 3) of any length: the inverse of `direction_at_angles`."""
+    sideways = np.hypot(direction[..., 0], direction[..., 1])
+    angle = np.arctan2(sideways, direction[..., 2])
+    stretch = np.divide(angle, sideways, out=np.ones_like(angle), where=sideways > 0.0)
+    angles: Array = direction[..., :2] * stretch[..., None]
+    return angles
+
+
 @dataclass(frozen=True, slots=True)
 class CameraOrientation:
     """How a camera's pixel axes lie in the telescope frame.

@@ -146,7 +146,7 @@ class Normalization:
         Fits take up part of a slope where it went along with direction, more than is linear: the exponent is larger
         than it seems, and so is its uncertainty.
         """
-        share = min(max(share, _LEAST_SHARE), 1.0)
+        share = min(share, 1.0) if share > _LEAST_SHARE else _LEAST_SHARE  # also where it is not known
         more = self.exponent / share - self.exponent
         sigma = self.exponent_uncertainty / share
         return replace(

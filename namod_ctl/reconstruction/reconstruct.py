@@ -44,7 +44,7 @@ _N_SCREENINGS = 3  # without the worst records the fits may show further ones
 _N_SCENES = 2  # the first fits to a run under clouds are too wide, and hide some of the scene
 _N_SELF_CALIBRATIONS = 2  # the first leaves a few per cent of what it removed
 _LEFT_SIGMA = 0.2
-_TRIAL_SIGMA = 2.0  # far enough from nothing to see the difference
+_TRIAL_SIGMA, _TRIAL_LEAST = 2.0, 0.01  # far enough from nothing to see the difference
 _RAYS_PER_FACET = 500
 
 
@@ -195,27 +195,33 @@ def fit_run(table: ResponseTable, instrument: Instrument, *, self_calibration: b
     if unknown:
         raise ConfigError(f"facet ids {unknown} of the run are not in the config of {instrument.name}")
     expected_rad = expected_size_rad(instrument)
-    given, removed = table, 0.0
-    bad, used, family, fits = _screen(given, expected_rad)
-    left = measure_normalization(used, fits)
+    bad, used, family, fits = _screen(table, expected_rad)
+    found = measure_normalization(used, fits)
     share = 1.0
-    if left.is_known:
-        share = _share_noticed(used, left, expected_rad)
-        left = left.with_refits(share)
-    if self_calibration and left.is_worth_removing:
-        for _ in range(_N_SELF_CALIBRATIONS):
-            removed += left.exponent
-            table = without_slope(given, removed)
-            bad, used, family, fits = _screen(table, expected_rad)
-            left = measure_normalization(used, fits).with_refits(share)
-            if not abs(left.exponent) > _LEFT_SIGMA * left.exponent_uncertainty:
-                break
-    return FittedRun(table, used, bad, family, fits, left.beside(removed), removed)
+    if found.is_known:
+        share = _share_noticed(used, found, expected_rad)
+        found = found.with_refits(share)
+    fitted = FittedRun(table, used, bad, family, fits, found, 0.0)
+    if not self_calibration or not found.is_worth_removing:
+        return fitted
+    removed, left = 0.0, found
+    for _ in range(_N_SELF_CALIBRATIONS):
+        removed += left.exponent
+        steady = without_slope(table, removed)
+        bad, used, family, fits = _screen(steady, expected_rad)
+        left = measure_normalization(used, fits).with_refits(share)
+        if not left.is_known:  # without it there is nothing to hold on to
+            return fitted
+        fitted = FittedRun(steady, used, bad, family, fits, left.beside(removed), removed)
+        if abs(left.exponent) < _LEFT_SIGMA * left.exponent_uncertainty:
+            break
+    return fitted
 
 
 def _share_noticed(used: ResponseTable, found: Normalization, expected_rad: float) -> float:
     """Share of an exponent that the measurement notices when it is taken out and the facets are fitted anew."""
-    trial = found.exponent + math.copysign(_TRIAL_SIGMA * found.exponent_uncertainty, found.exponent)
+    further = max(_TRIAL_SIGMA * found.exponent_uncertainty, _TRIAL_LEAST)
+    trial = found.exponent + math.copysign(further, found.exponent)
     table = without_slope(used, trial)
     _, fits = fit_reflector(table, expected_rad)
     return (found.exponent - measure_normalization(table, fits).exponent) / trial

@@ -23,7 +23,7 @@ from namod_ctl.twin.star_frame import StarFrames
 
 Array = NDArray[np.float64]
 
-PRESSURE_AT_SEA_HPA, SCALE_HEIGHT_M = 1010.0, 8434.0
+SCALE_HEIGHT_M = 8434.0
 MEAN_TEMPERATURE_K, TEMPERATURE_K = 283.0, 283.15
 MAX_STEPS = 200
 

@@ -116,7 +116,7 @@ def foreign_sky(rng):
 
 
 def known_somewhere(rng, radius_deg, far_from=None):
-    """The catalogue's stars within an angle of some place of the sky, which is not on the half of `far_from`'s field."""
+    """The catalogue's stars within an angle of some place of the sky, far from the field of `far_from`."""
     directions = CATALOGUE.directions(2026.5)
     near = directions[rng.integers(len(directions))]
     if far_from is not None:

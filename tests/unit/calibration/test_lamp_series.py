@@ -10,6 +10,7 @@ from namod_ctl.calibration.lamp_series import (
     at_distance,
     lit_patch,
     measure_response,
+    middle_of,
     patch_dark,
     refuse_wandering,
     without_hot,
@@ -35,6 +36,16 @@ def test_patch_lies_within_the_lit_disc() -> None:
     response = measure_response(image, patch, 255.0, "frame", 0, 0.1, 0.0)
     assert response.mean_adu[0] == pytest.approx(155.0, abs=0.1)
     assert response.noise_adu[0] == pytest.approx(np.hypot(0.8, 12.0**-0.5), rel=0.05)
+
+
+def test_large_patch_is_measured_in_its_middle() -> None:
+    patch = lit_patch(np.full((900, 1200), 150, np.uint8), 5.0, 255.0, "frame")
+    inner = middle_of(patch)
+    y, x = np.nonzero(inner.is_inside)
+    assert inner.n_pixels == 500**2
+    assert (y.mean(), x.mean()) == pytest.approx((449.5, 599.5), abs=1.0)
+    small = lit_patch(disc(60, 80, 30, 150.0), 5.0, 255.0, "frame")
+    assert np.array_equal(middle_of(small).is_inside, small.is_inside)
 
 
 def test_points_of_light_and_darkness_are_no_lamp() -> None:
