@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 
 from namod_ctl.app.build.twin import build_twin
 from namod_ctl.app.config.instrument import load_config
-from namod_ctl.app.gravity_files import read_lut
-from namod_ctl.calibration.gravity import RunOfFacets, SagFit, fit_sag
-from namod_ctl.calibration.gravity_table import GravityTable, table_of_fit, zenith_grid_rad
-from namod_ctl.calibration.zenith_path import ZenithPath
+from namod_ctl.app.lut.files import read_lut
+from namod_ctl.calibration.gravity.gravity_table import GravityTable, table_of_fit, zenith_grid_rad
+from namod_ctl.calibration.gravity.sag_of_runs import RunOfFacets, SagFit, fit_sag
+from namod_ctl.calibration.gravity.zenith_path import ZenithPath
 from namod_ctl.core.units import arcmin_to_rad, deg_to_rad, rad_to_arcmin, rad_to_deg
 from namod_ctl.twin.reflector import TwinReflector
 from namod_ctl.twin.settings import ReflectorSettings, SkySettings, TwinSettings

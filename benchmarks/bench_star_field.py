@@ -47,12 +47,12 @@ from star_field_rig import (
     seen_stars,
 )
 
-from namod_ctl.calibration.field_geometry import Hint, Watch, solve_field
-from namod_ctl.calibration.observed_sky import julian_year, observed_directions
-from namod_ctl.calibration.plate_solution import lens_priors
-from namod_ctl.calibration.star_field import field_of_frames, stars_of_frame
-from namod_ctl.calibration.star_match import MAX_FALSE_EXPECTED
-from namod_ctl.calibration.star_search import FieldSearch
+from namod_ctl.calibration.geometry.field_geometry import Hint, Watch, solve_field
+from namod_ctl.calibration.geometry.plate_solution import lens_priors
+from namod_ctl.calibration.geometry.star_field import field_of_frames, stars_of_frame
+from namod_ctl.calibration.geometry.star_match import MAX_FALSE_EXPECTED
+from namod_ctl.calibration.geometry.star_search import FieldSearch
+from namod_ctl.calibration.sky.observed_sky import julian_year, observed_directions
 from namod_ctl.core.errors import DataQualityError
 from namod_ctl.core.units import deg_to_rad, rad_to_deg, rad_to_mdeg
 from namod_ctl.twin.sensor import Sensor

@@ -37,12 +37,12 @@ from test_chessboard import projected as projected_board
 
 from namod_ctl.app.build.instrument import build_instrument
 from namod_ctl.app.config.instrument import load_config
-from namod_ctl.calibration.chessboard import calibrate_with_boards
-from namod_ctl.calibration.observed_sky import Site
-from namod_ctl.calibration.star_path import apparent_path, path_of_declination, place_of_date
-from namod_ctl.calibration.star_streak import fit_streak
-from namod_ctl.calibration.star_trail import fit_trail
-from namod_ctl.calibration.trail_frames import find_trail, trail_spots
+from namod_ctl.calibration.geometry.chessboard import calibrate_with_boards
+from namod_ctl.calibration.geometry.star_streak import fit_streak
+from namod_ctl.calibration.geometry.star_trail import fit_trail
+from namod_ctl.calibration.geometry.trail_frames import find_trail, trail_spots
+from namod_ctl.calibration.sky.observed_sky import Site
+from namod_ctl.calibration.sky.star_path import apparent_path, path_of_declination, place_of_date
 from namod_ctl.core.errors import DataQualityError
 from namod_ctl.core.units import arcsec_to_rad, deg_to_rad, rad_to_deg, rad_to_mdeg
 from namod_ctl.optics.camera_model import CameraModel, Distortion

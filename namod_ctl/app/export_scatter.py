@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from namod_ctl.app.build.gravity_runs import GravityRuns, read_gravity_runs
-from namod_ctl.calibration.gravity import RunOfFacets
-from namod_ctl.calibration.random_alignment import TiltSpread, ZenithLaw, scatter_over_zenith, spread_of_run
+from namod_ctl.calibration.gravity.random_alignment import TiltSpread, ZenithLaw, scatter_over_zenith, spread_of_run
+from namod_ctl.calibration.gravity.sag_of_runs import RunOfFacets
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.optics.raytrace import facet_moments, trace
 from namod_ctl.optics.reflector import Reflector

@@ -13,8 +13,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from namod_ctl.calibration.dark_frames import DarkFrame, refuse_light
-from namod_ctl.calibration.lamp_series import (
+from namod_ctl.calibration.lamp.dark_frames import DarkFrame, refuse_light
+from namod_ctl.calibration.lamp.lamp_series import (
     Patch,
     PatchDark,
     Placement,

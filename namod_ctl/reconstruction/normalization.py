@@ -80,10 +80,11 @@ class Normalization:
         Facets that have a say.
     doubt
         Why nothing can be said; empty where something can.
-    record_index, magnitude, log_factor, log_factor_uncertainty
+    record_index, magnitude, steady_magnitude, log_factor, log_factor_uncertainty
         Shape (n_records,). The records that have a say: how many magnitudes fainter the star was than in the run's
-        typical record, and the natural log of the factor by which all facets together responded more than they do with
-        a star of typical intensity. All without a correction.
+        typical record, the same without the noise of its own measurement where the neighbouring records tell it, and
+        the natural log of the factor by which all facets together responded more than they do with a star of typical
+        intensity. All without a correction.
     """
 
     exponent: float
@@ -93,6 +94,7 @@ class Normalization:
     doubt: str
     record_index: NDArray[np.int64]
     magnitude: Array
+    steady_magnitude: Array
     log_factor: Array
     log_factor_uncertainty: Array
 
@@ -259,7 +261,7 @@ def normalization_of(witnesses: Sequence[Witness], record_index: NDArray[np.int6
             noise, _ = common_factors(witnesses, direct.lefts, n)
             bias = float(np.var(noise[lit]) / np.var(log_star[lit]))
             if bias < _MAX_BIAS:
-                range_mag = direct_range_mag
+                range_mag, told = direct_range_mag, log_star
                 solution = replace(direct, sigma=math.hypot(direct.sigma, bias))
         if solution is None and range_mag >= MIN_RANGE_MAG:
             doubt = "the star's brightness jumped from record to record: its changes can not be told from its noise"
@@ -276,6 +278,7 @@ def normalization_of(witnesses: Sequence[Witness], record_index: NDArray[np.int6
         doubt,
         record_index[lit],
         log_star[lit] / PER_MAGNITUDE,
+        told[lit] / PER_MAGNITUDE,
         factor[lit],
         1.0 / np.sqrt(information[lit]),
     )

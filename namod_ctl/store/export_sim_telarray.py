@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from namod_ctl.calibration.random_alignment import TiltSpread, ZenithLaw
+from namod_ctl.calibration.gravity.random_alignment import TiltSpread, ZenithLaw
 from namod_ctl.core.units import m_to_cm, rad_to_deg
 from namod_ctl.optics.reflector import Reflector
 

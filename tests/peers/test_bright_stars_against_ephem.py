@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from namod_ctl.calibration.star_catalogue import bright_stars
+from namod_ctl.calibration.sky.star_catalogue import bright_stars
 
 ephem_stars = pytest.importorskip("ephem.stars", reason="ephem is not installed (extra 'peers')")
 

@@ -12,9 +12,9 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "unit" / "calibration"))
 
 from star_field_rig import CAMERA, CATALOGUE, FAINT, SITE, STAR_SIZE_RAD, inside, rich_scene
 
-from namod_ctl.calibration.field_geometry import Watch, solve_field
-from namod_ctl.calibration.observed_sky import observed_directions
-from namod_ctl.calibration.star_field import stars_of_frame
+from namod_ctl.calibration.geometry.field_geometry import Watch, solve_field
+from namod_ctl.calibration.geometry.star_field import stars_of_frame
+from namod_ctl.calibration.sky.observed_sky import observed_directions
 from namod_ctl.core.units import mdeg_to_rad
 from namod_ctl.twin.sensor import Sensor
 from namod_ctl.twin.settings import STAR_CAMERA

@@ -11,7 +11,7 @@ from namod_ctl.app.build.frame_series import HOW_TO, FrameSeries
 from namod_ctl.app.build.instrument import build_instrument
 from namod_ctl.app.campaign_choice import check_run
 from namod_ctl.app.config.instrument import InstrumentConfig
-from namod_ctl.calibration.optical_axis import AxisPosition, axis_of_facets, axis_of_held_star
+from namod_ctl.calibration.geometry.optical_axis import AxisPosition, axis_of_facets, axis_of_held_star
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.units import arcmin_to_rad, deg_to_rad
 from namod_ctl.imaging.measure import without_dark

@@ -16,8 +16,8 @@ from namod_ctl.app.build.instrument import build_instrument
 from namod_ctl.app.build.run_zenith import when_facets_were_seen, zenith_of_run, zenith_of_star
 from namod_ctl.app.campaign_choice import check_run
 from namod_ctl.app.config.instrument import InstrumentConfig
-from namod_ctl.calibration.gravity import RunOfFacets
-from namod_ctl.calibration.zenith_path import ZenithPath
+from namod_ctl.calibration.gravity.sag_of_runs import RunOfFacets
+from namod_ctl.calibration.gravity.zenith_path import ZenithPath
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.flags import FacetFlag
 from namod_ctl.core.units import deg_to_rad

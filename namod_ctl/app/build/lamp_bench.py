@@ -12,7 +12,7 @@ from namod_ctl.app.build.cameras import open_camera
 from namod_ctl.app.build.instrument import build_instrument
 from namod_ctl.app.config.instrument import InstrumentConfig
 from namod_ctl.app.config.schema import RecordingSection
-from namod_ctl.calibration.lamp_series import Placement
+from namod_ctl.calibration.lamp.lamp_series import Placement
 from namod_ctl.core.clock import SystemMonotonicClock
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.interfaces import Camera, MonotonicClock

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from namod_ctl.app.build.twin_note import noted_twin
 from namod_ctl.app.config.schema import SiteSection
-from namod_ctl.calibration.observed_sky import Site
-from namod_ctl.calibration.star_catalogue import bright_stars, number_of_star
-from namod_ctl.calibration.star_path import apparent_path
-from namod_ctl.calibration.zenith_path import ZenithPath
+from namod_ctl.calibration.gravity.zenith_path import ZenithPath
+from namod_ctl.calibration.sky.observed_sky import Site
+from namod_ctl.calibration.sky.star_catalogue import bright_stars, number_of_star
+from namod_ctl.calibration.sky.star_path import apparent_path
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.units import deg_to_rad
 from namod_ctl.store.run import RunStore

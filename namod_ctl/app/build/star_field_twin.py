@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from namod_ctl.calibration.observed_sky import Site, julian_year, observed_directions
-from namod_ctl.calibration.star_catalogue import StarCatalogue
+from namod_ctl.calibration.sky.observed_sky import Site, julian_year, observed_directions
+from namod_ctl.calibration.sky.star_catalogue import StarCatalogue
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.units import deg_to_rad
 from namod_ctl.optics.instrument import Instrument

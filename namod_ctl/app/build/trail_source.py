@@ -12,9 +12,9 @@ import numpy as np
 from namod_ctl.app.build.camera_choice import ChosenCamera
 from namod_ctl.app.build.frame_series import HOW_TO, FrameSeries, Image
 from namod_ctl.app.views.camera_views import Watch
-from namod_ctl.calibration.observed_sky import Site
-from namod_ctl.calibration.star_path import place_of_date
-from namod_ctl.calibration.trail_frames import TrailSpot, trail_spots
+from namod_ctl.calibration.geometry.trail_frames import TrailSpot, trail_spots
+from namod_ctl.calibration.sky.observed_sky import Site
+from namod_ctl.calibration.sky.star_path import place_of_date
 from namod_ctl.core.clock import Clock
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.units import deg_to_rad

@@ -17,7 +17,7 @@ from namod_ctl.app.alignment_files import facet_table, read_alignment, table_to_
 from namod_ctl.app.build.instrument import build_instrument
 from namod_ctl.app.config.instrument import InstrumentConfig
 from namod_ctl.app.export_scatter import scatter_of_runs, zenith_distances_deg
-from namod_ctl.calibration.found_normals import tilts_of_theta
+from namod_ctl.calibration.gravity.found_normals import tilts_of_theta
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.optics.raytrace import tilted_normals
 from namod_ctl.optics.reflector import FacetShape, Reflector

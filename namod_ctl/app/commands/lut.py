@@ -10,17 +10,17 @@ import typer
 from numpy.typing import NDArray
 from rich.console import Console
 
-from namod_ctl.app.bias_sheets import AIMS_FILE, bias_files
 from namod_ctl.app.build.gravity_runs import read_gravity_runs
 from namod_ctl.app.build.instrument import build_instrument
 from namod_ctl.app.build.twin import load_twin_settings
 from namod_ctl.app.config.instrument import InstrumentConfig, load_config
-from namod_ctl.app.gravity_files import lut_of_fit, lut_to_json, read_lut
 from namod_ctl.app.lazy_commands import MARKUP
-from namod_ctl.app.lut_application import apply_table
-from namod_ctl.app.lut_wishes import side_of_words, sides_of_words, stars_of_words, weights_of_words, zeniths_of_words
+from namod_ctl.app.lut.application import apply_table
+from namod_ctl.app.lut.files import lut_of_fit, lut_to_json, read_lut
+from namod_ctl.app.lut.wishes import side_of_words, sides_of_words, stars_of_words, weights_of_words, zeniths_of_words
 from namod_ctl.app.pictures.figure_style import figure_to_png
 from namod_ctl.app.pictures.lut_figure import draw_lut
+from namod_ctl.app.sheets.bias_sheets import AIMS_FILE, bias_files
 from namod_ctl.app.sheets.ladder_sheets import PDF_FILE
 from namod_ctl.app.views.lut_tables import (
     areas_table,
@@ -30,9 +30,9 @@ from namod_ctl.app.views.lut_tables import (
     terms_in_words,
     tilts_table,
 )
-from namod_ctl.calibration.bias_alignment import Aim, best_compromise
-from namod_ctl.calibration.gravity import fit_sag
-from namod_ctl.calibration.gravity_table import BEYOND_RAD, GravityTable, zenith_grid_rad
+from namod_ctl.calibration.gravity.bias_alignment import Aim, best_compromise
+from namod_ctl.calibration.gravity.gravity_table import BEYOND_RAD, GravityTable, zenith_grid_rad
+from namod_ctl.calibration.gravity.sag_of_runs import fit_sag
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.units import deg_to_rad, rad_to_deg

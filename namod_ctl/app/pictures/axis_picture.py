@@ -10,7 +10,7 @@ from matplotlib.patches import Ellipse
 from matplotlib.patheffects import withStroke
 
 from namod_ctl.app.pictures.figure_style import DPI, ORANGE, SKY, VERMILLION, ellipse_axes
-from namod_ctl.calibration.optical_axis import AxisFit, AxisPosition
+from namod_ctl.calibration.geometry.optical_axis import AxisFit, AxisPosition
 from namod_ctl.core.units import rad_to_deg
 from namod_ctl.optics.camera_model import CameraModel
 

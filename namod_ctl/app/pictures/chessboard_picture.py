@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from namod_ctl.app.pictures.figure_style import DPI, ORANGE, SKY, VERMILLION
-from namod_ctl.calibration.chessboard import ChessboardFit
+from namod_ctl.calibration.geometry.chessboard import ChessboardFit
 from namod_ctl.core.units import rad_to_deg, rad_to_mdeg
 from namod_ctl.optics.camera_model import CameraModel
 

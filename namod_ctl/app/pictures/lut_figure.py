@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from namod_ctl.app.gravity_files import Lut
+from namod_ctl.app.lut.files import Lut
 from namod_ctl.app.pictures.figure_style import DPI, ORANGE, SKY, VERMILLION
 from namod_ctl.core.units import rad2_to_arcmin2, rad_to_arcmin, rad_to_deg
 

@@ -30,7 +30,7 @@ def draw_normalization(normalization: Normalization, telescope: str) -> Figure:
     figure.subplots_adjust(left=0.11, right=0.97, top=0.83, bottom=0.08, hspace=0.24)
     trend = PER_MAGNITUDE * n.exponent * n.magnitude
     _panel(above, n, np.exp(n.log_factor), "As recorded")
-    line = np.linspace(n.magnitude.min(), n.magnitude.max(), 100)
+    line = np.linspace(n.steady_magnitude.min(), n.steady_magnitude.max(), 100)
     law, sigma = np.exp(PER_MAGNITUDE * n.exponent * line), np.abs(PER_MAGNITUDE * line) * n.exponent_uncertainty
     above.plot(line, law, color=VERMILLION, label="fitted slope, with one standard deviation")
     above.fill_between(line, law * np.exp(-sigma), law * np.exp(sigma), color=VERMILLION, alpha=0.25, linewidth=0.0)
@@ -43,7 +43,7 @@ def draw_normalization(normalization: Normalization, telescope: str) -> Figure:
     above.legend(loc="best", fontsize="small", framealpha=0.9)
     top = above.secondary_xaxis("top", functions=(_intensity_of, _magnitude_of))
     top.set_xlabel("intensity of the star / that of the typical record")
-    ticks = [tick for tick in (0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50) if _is_within(tick, n.magnitude)]
+    ticks = [tick for tick in (0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50) if _is_within(tick, n.steady_magnitude)]
     top.set_xticks(ticks, labels=[f"{tick:g}" for tick in ticks])
     figure.suptitle(
         f"{telescope}: response of {n.n_facets} facets in {len(n.magnitude)} records\n{slope_in_words(n)}",
@@ -53,14 +53,24 @@ def draw_normalization(normalization: Normalization, telescope: str) -> Figure:
 
 
 def _panel(axes: Axes, n: Normalization, factor: NDArray[np.float64], title: str) -> None:
-    """The common factor of each record, and their means over magnitudes."""
+    """The common factor of each record, and their medians over magnitudes.
+
+    Over the magnitude that the neighbouring records tell: the noise of a record's own star intensity divides its
+    responses, too, and would bend the ends of the curve.
+    """
     axes.axhline(1.0, color="black", linewidth=0.8, linestyle="--")
     told = n.log_factor_uncertainty < _MAX_ERROR
     axes.plot(
-        n.magnitude[told], factor[told], ".", color=_GREY, markersize=3.5, alpha=0.7, label="facets lit in one record"
+        n.steady_magnitude[told],
+        factor[told],
+        ".",
+        color=_GREY,
+        markersize=3.5,
+        alpha=0.7,
+        label="facets lit in one record",
     )
-    edges = np.quantile(n.magnitude, np.linspace(0.0, 1.0, _N_BINS + 1))
-    bin_of = np.clip(np.searchsorted(edges, n.magnitude, side="right") - 1, 0, _N_BINS - 1)
+    edges = np.quantile(n.steady_magnitude, np.linspace(0.0, 1.0, _N_BINS + 1))
+    bin_of = np.clip(np.searchsorted(edges, n.steady_magnitude, side="right") - 1, 0, _N_BINS - 1)
     found = []
     for k in range(_N_BINS):
         inside = np.flatnonzero((bin_of == k) & told)
@@ -68,7 +78,7 @@ def _panel(axes: Axes, n: Normalization, factor: NDArray[np.float64], title: str
             continue
         median = float(np.median(factor[inside]))
         error = 1.4826 * float(np.median(np.abs(factor[inside] - median))) * np.sqrt(np.pi / 2.0 / len(inside))
-        found.append((float(np.mean(n.magnitude[inside])), median, error))
+        found.append((float(np.mean(n.steady_magnitude[inside])), median, error))
     if found:
         x, y, error = np.array(found).T
         axes.errorbar(x, y, error, fmt="o", color="#0072b2", mfc=SKY, markersize=5.5, capsize=2.5, label="their median")

@@ -11,7 +11,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter
 from numpy.typing import NDArray
 
 from namod_ctl.app.pictures.figure_style import DPI, ORANGE, SKY, VERMILLION, colours
-from namod_ctl.calibration.radiometric_verdict import RadiometricFinding
+from namod_ctl.calibration.lamp.radiometric_verdict import RadiometricFinding
 
 Array = NDArray[np.float64]
 

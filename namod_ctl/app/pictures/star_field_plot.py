@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from namod_ctl.app.pictures.figure_style import DPI, ORANGE, SKY, VERMILLION
 from namod_ctl.app.views.star_field_table import star_name
-from namod_ctl.calibration.field_geometry import FieldGeometry
-from namod_ctl.calibration.plate_solution import K1, K1_OF_TANGENT, K2_OF_TANGENT, angles_of_directions
-from namod_ctl.calibration.star_catalogue import StarCatalogue
-from namod_ctl.calibration.star_search import SeenStars
+from namod_ctl.calibration.geometry.field_geometry import FieldGeometry
+from namod_ctl.calibration.geometry.plate_solution import K1, K1_OF_TANGENT, K2_OF_TANGENT, angles_of_directions
+from namod_ctl.calibration.geometry.star_search import SeenStars
+from namod_ctl.calibration.sky.star_catalogue import StarCatalogue
 from namod_ctl.core.units import rad_to_deg
 from namod_ctl.optics.camera_model import CameraModel
 

@@ -6,8 +6,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from namod_ctl.app.pictures.figure_style import DPI, ORANGE, SKY, VERMILLION
-from namod_ctl.calibration.star_trail import TrailFit
-from namod_ctl.calibration.trail_solution import Trail
+from namod_ctl.calibration.geometry.star_trail import TrailFit
+from namod_ctl.calibration.geometry.trail_solution import Trail
 from namod_ctl.core.units import rad_to_deg, rad_to_mdeg
 from namod_ctl.optics.camera_model import CameraModel
 

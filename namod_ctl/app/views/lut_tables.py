@@ -11,7 +11,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 from rich.text import Text
 
-from namod_ctl.app.gravity_files import Lut
+from namod_ctl.app.lut.files import Lut
 from namod_ctl.core.units import deg_to_rad, rad2_to_arcmin2, rad_to_arcmin, rad_to_deg
 
 Array = NDArray[np.float64]

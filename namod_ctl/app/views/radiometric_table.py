@@ -7,7 +7,7 @@ import math
 import numpy as np
 from rich.table import Table
 
-from namod_ctl.calibration.radiometric_verdict import RadiometricFinding
+from namod_ctl.calibration.lamp.radiometric_verdict import RadiometricFinding
 
 
 def radiometric_table(finding: RadiometricFinding, by_config: tuple[float, float, float]) -> Table:

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from namod_ctl.calibration.field_geometry import FieldGeometry, bend_in_words
-from namod_ctl.calibration.star_catalogue import StarCatalogue
+from namod_ctl.calibration.geometry.field_geometry import FieldGeometry, bend_in_words
+from namod_ctl.calibration.sky.star_catalogue import StarCatalogue
 from namod_ctl.core.units import rad_to_deg, rad_to_mdeg
 from namod_ctl.optics.camera_model import CameraModel
 

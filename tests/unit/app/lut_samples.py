@@ -13,8 +13,8 @@ from namod_ctl.app.alignment_files import write_alignment
 from namod_ctl.app.build.twin import build_twin
 from namod_ctl.app.build.twin_note import note_twin
 from namod_ctl.app.config.instrument import InstrumentConfig, load_config
-from namod_ctl.app.gravity_files import Lut, LutRun, lut_to_json
-from namod_ctl.calibration.gravity_table import GravityTable
+from namod_ctl.app.lut.files import Lut, LutRun, lut_to_json
+from namod_ctl.calibration.gravity.gravity_table import GravityTable
 from namod_ctl.core.clock import Clock, SystemClock
 from namod_ctl.core.records import Record
 from namod_ctl.core.units import arcmin_to_rad, deg_to_rad

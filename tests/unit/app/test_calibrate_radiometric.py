@@ -23,7 +23,7 @@ from namod_ctl.app.commands.calibrate.radiometric import radiometric
 from namod_ctl.app.config.calibration_schema import DarkCalibration, RadiometricCalibration
 from namod_ctl.app.config.calibrations import read_calibration
 from namod_ctl.app.config.instrument import load_config
-from namod_ctl.calibration.lamp_series import at_distance
+from namod_ctl.calibration.lamp.lamp_series import at_distance
 from namod_ctl.core.errors import ConfigError, DataQualityError
 from namod_ctl.twin.lamp import TwinLamp
 
@@ -114,7 +114,7 @@ def changed(pictures: Path, tmp_path: Path) -> Callable[[Callable[[dict[str, str
 def run(command: Callable[..., None], config_path: Path, *arguments: str | Path) -> Result:
     app = typer.Typer(add_completion=False)
     app.command()(command)
-    return CliRunner().invoke(app, ["star_camera", "--config", str(config_path), *map(str, arguments)])
+    return CliRunner().invoke(app, ["star", "--config", str(config_path), *map(str, arguments)])
 
 
 def refused(result: Result, match: str) -> None:

@@ -19,7 +19,7 @@ from star_field_rig import CAMERA, CATALOGUE, STAR_SIZE_RAD, rich_scene
 
 from namod_ctl.app.commands.calibrate.star_field import star_field
 from namod_ctl.app.config.calibrations import read_calibration
-from namod_ctl.calibration.observed_sky import julian_year
+from namod_ctl.calibration.sky.observed_sky import julian_year
 from namod_ctl.core.errors import ConfigError, DataQualityError
 from namod_ctl.core.units import rad_to_deg, rad_to_mdeg
 from namod_ctl.twin.sensor import Sensor

@@ -35,9 +35,9 @@ from namod_ctl.app.build.run_zenith import when_facets_were_seen, zenith_of_run
 from namod_ctl.app.commands.lut import app
 from namod_ctl.app.config.instrument import load_config
 from namod_ctl.app.config.schema import SiteSection
-from namod_ctl.app.gravity_files import lut_from_json, lut_to_json, read_lut
-from namod_ctl.app.lut_application import apply_table
-from namod_ctl.calibration.gravity_table import GravityTable
+from namod_ctl.app.lut.application import apply_table
+from namod_ctl.app.lut.files import lut_from_json, lut_to_json, read_lut
+from namod_ctl.calibration.gravity.gravity_table import GravityTable
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.drives import DriveState
 from namod_ctl.core.errors import ConfigError, NamodError

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from namod_ctl.calibration.lamp_series import Placement, at_distance, at_level
-from namod_ctl.calibration.radiometric_verdict import RadiometricFinding, calibrate_radiometric
+from namod_ctl.calibration.lamp.lamp_series import Placement, at_distance, at_level
+from namod_ctl.calibration.lamp.radiometric_verdict import RadiometricFinding, calibrate_radiometric
 from namod_ctl.cycle.lamp_recording import LampSeries, SeriesPlan, dark_exposures_s, record_darks, record_lamp_series
 from namod_ctl.optics.camera_model import CameraModel, RadiometricLaw
 from namod_ctl.optics.coordinates import CameraOrientation

@@ -9,9 +9,9 @@ from itertools import repeat
 import numpy as np
 from numpy.typing import NDArray
 
-from namod_ctl.calibration.gravity import RunOfFacets
-from namod_ctl.calibration.gravity_table import GravityTable
-from namod_ctl.calibration.zenith_path import ZenithPath
+from namod_ctl.calibration.gravity.gravity_table import GravityTable
+from namod_ctl.calibration.gravity.sag_of_runs import RunOfFacets
+from namod_ctl.calibration.gravity.zenith_path import ZenithPath
 from namod_ctl.core.units import arcmin_to_rad, deg_to_rad
 
 Array = NDArray[np.float64]

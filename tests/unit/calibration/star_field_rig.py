@@ -9,10 +9,10 @@ import numpy as np
 
 from namod_ctl.app.build.instrument import build_instrument
 from namod_ctl.app.config.instrument import load_config
-from namod_ctl.calibration.observed_sky import Site, julian_year, observed_directions
-from namod_ctl.calibration.star_catalogue import bright_stars
-from namod_ctl.calibration.star_match import known_stars
-from namod_ctl.calibration.star_search import SeenStars
+from namod_ctl.calibration.geometry.star_match import known_stars
+from namod_ctl.calibration.geometry.star_search import SeenStars
+from namod_ctl.calibration.sky.observed_sky import Site, julian_year, observed_directions
+from namod_ctl.calibration.sky.star_catalogue import bright_stars
 from namod_ctl.core.units import deg_to_rad, mdeg_to_rad
 from namod_ctl.twin.star_field import FieldCatalogue, Lens, Watch, faint_stars, image_of_directions, seen_from_site
 

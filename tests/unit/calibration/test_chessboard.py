@@ -11,7 +11,7 @@ from trail_maker import DEG
 
 from namod_ctl.app.build.instrument import build_instrument
 from namod_ctl.app.config.instrument import load_config
-from namod_ctl.calibration.chessboard import BoardView, calibrate_with_boards, find_board
+from namod_ctl.calibration.geometry.chessboard import BoardView, calibrate_with_boards, find_board
 from namod_ctl.core.errors import DataQualityError
 from namod_ctl.optics.camera_model import Distortion
 from namod_ctl.twin.chessboard import Board, BoardPose, draw_poses, lens_of, render_board

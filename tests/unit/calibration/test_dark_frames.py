@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from namod_ctl.calibration.dark_frames import DarkFrame, measure_dark_frames
-from namod_ctl.calibration.dark_level import dark_level
+from namod_ctl.calibration.lamp.dark_frames import DarkFrame, measure_dark_frames
+from namod_ctl.calibration.lamp.dark_level import dark_level
 from namod_ctl.core.errors import DataQualityError
 
 ROWS, COLUMNS = 96, 128

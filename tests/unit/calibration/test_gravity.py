@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from leaning_dish import ERROR_RAD, FOUR, N_FACETS, Dish, dish, runs
 
-from namod_ctl.calibration.gravity import RunOfFacets, SagFit, fit_sag
-from namod_ctl.calibration.zenith_path import ZenithPath
+from namod_ctl.calibration.gravity.sag_of_runs import RunOfFacets, SagFit, fit_sag
+from namod_ctl.calibration.gravity.zenith_path import ZenithPath
 from namod_ctl.core.errors import DataQualityError
 from namod_ctl.core.units import arcmin_to_rad, deg_to_rad, rad_to_deg
 

@@ -10,9 +10,9 @@ import pytest
 from leaning_dish import N_FACETS, Dish, dish, runs, table
 from scipy.optimize import minimize
 
-from namod_ctl.calibration.bias_alignment import Aim, best_compromise
-from namod_ctl.calibration.gravity import fit_sag
-from namod_ctl.calibration.gravity_table import GravityTable, table_of_fit, zenith_grid_rad
+from namod_ctl.calibration.gravity.bias_alignment import Aim, best_compromise
+from namod_ctl.calibration.gravity.gravity_table import GravityTable, table_of_fit, zenith_grid_rad
+from namod_ctl.calibration.gravity.sag_of_runs import fit_sag
 from namod_ctl.core.errors import ConfigError, DataQualityError
 from namod_ctl.core.units import arcmin_to_rad, deg_to_rad, rad_to_arcmin
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from namod_ctl.calibration.dark_frames import DarkFrame
-from namod_ctl.calibration.lamp_series import (
+from namod_ctl.calibration.lamp.dark_frames import DarkFrame
+from namod_ctl.calibration.lamp.lamp_series import (
     at_distance,
     lit_patch,
     measure_response,

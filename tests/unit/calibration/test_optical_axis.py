@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from response_maker import ARCMIN, disc, instrument, make_run
 
-from namod_ctl.calibration.optical_axis import AxisPosition, axis_of_facets, axis_of_held_star, combine_axis
+from namod_ctl.calibration.geometry.optical_axis import AxisPosition, axis_of_facets, axis_of_held_star, combine_axis
 from namod_ctl.core.errors import DataQualityError
 from namod_ctl.core.flags import FacetFlag
 from namod_ctl.optics.coordinates import CameraOrientation

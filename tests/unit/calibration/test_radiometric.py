@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from lamp_rig import FULL_SCALE_ADU, LAWS, Case, intensity_departure, recorded, series_of_twin
 
-from namod_ctl.calibration.exposure_ratio import exposure_ratio
-from namod_ctl.calibration.lamp_series import Response, at_distance
-from namod_ctl.calibration.lamp_visits import visits_of
-from namod_ctl.calibration.radiometric_checks import check_exposure_range
-from namod_ctl.calibration.radiometric_fit import LampData, LawForm, fit_law
-from namod_ctl.calibration.radiometric_verdict import RadiometricFinding, calibrate_radiometric
+from namod_ctl.calibration.lamp.exposure_ratio import exposure_ratio
+from namod_ctl.calibration.lamp.lamp_series import Response, at_distance
+from namod_ctl.calibration.lamp.lamp_visits import visits_of
+from namod_ctl.calibration.lamp.radiometric_checks import check_exposure_range
+from namod_ctl.calibration.lamp.radiometric_fit import LampData, LawForm, fit_law
+from namod_ctl.calibration.lamp.radiometric_verdict import RadiometricFinding, calibrate_radiometric
 from namod_ctl.core.errors import DataQualityError
 from namod_ctl.cycle.lamp_recording import LampSeries
 

@@ -7,14 +7,14 @@ import pytest
 
 from namod_ctl.app.build.instrument import build_instrument
 from namod_ctl.app.config.instrument import load_config
-from namod_ctl.calibration.gravity import RunOfFacets
-from namod_ctl.calibration.random_alignment import (
+from namod_ctl.calibration.gravity.random_alignment import (
     fit_zenith_law,
     scatter_over_zenith,
     spread_of_run,
     spread_of_tilts,
 )
-from namod_ctl.calibration.zenith_path import ZenithPath
+from namod_ctl.calibration.gravity.sag_of_runs import RunOfFacets
+from namod_ctl.calibration.gravity.zenith_path import ZenithPath
 from namod_ctl.core.errors import DataQualityError
 from namod_ctl.core.units import arcmin_to_rad, deg_to_rad
 from namod_ctl.twin.reflector import TwinReflector

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from star_field_rig import CAMERA, CATALOGUE, FAINT, SITE, STAR_SIZE_RAD, inside, rich_scene
 
-from namod_ctl.calibration.field_geometry import Hint, Watch, solve_field
-from namod_ctl.calibration.observed_sky import julian_year, observed_directions
-from namod_ctl.calibration.star_field import field_of_frames, stars_of_frame
+from namod_ctl.calibration.geometry.field_geometry import Hint, Watch, solve_field
+from namod_ctl.calibration.geometry.star_field import field_of_frames, stars_of_frame
+from namod_ctl.calibration.sky.observed_sky import julian_year, observed_directions
 from namod_ctl.core.errors import ConfigError, DataQualityError
 from namod_ctl.core.units import deg_to_rad, mdeg_to_rad
 from namod_ctl.twin.sensor import Sensor

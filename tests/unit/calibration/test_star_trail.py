@@ -11,10 +11,10 @@ from trail_maker import BEGUN, DEG, MDEG, ROQUE, Lens, ideal_theta, seen_by_astr
 
 from namod_ctl.app.build.instrument import build_instrument
 from namod_ctl.app.config.instrument import load_config
-from namod_ctl.calibration.observed_sky import Site
-from namod_ctl.calibration.star_path import REFRACTION_SHRINKS, apparent_path, path_of_declination, place_of_date
-from namod_ctl.calibration.star_trail import fit_trail
-from namod_ctl.calibration.trail_solution import Trail
+from namod_ctl.calibration.geometry.star_trail import fit_trail
+from namod_ctl.calibration.geometry.trail_solution import Trail
+from namod_ctl.calibration.sky.observed_sky import Site
+from namod_ctl.calibration.sky.star_path import REFRACTION_SHRINKS, apparent_path, path_of_declination, place_of_date
 from namod_ctl.core.errors import ConfigError, DataQualityError
 from namod_ctl.optics.camera_model import Distortion
 

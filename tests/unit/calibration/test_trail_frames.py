@@ -10,10 +10,10 @@ from trail_maker import DEG, MDEG
 
 from namod_ctl.app.build.instrument import build_instrument
 from namod_ctl.app.config.instrument import load_config
-from namod_ctl.calibration.star_path import path_of_declination
-from namod_ctl.calibration.star_streak import fit_streak
-from namod_ctl.calibration.star_trail import fit_trail
-from namod_ctl.calibration.trail_frames import find_trail, trail_spots
+from namod_ctl.calibration.geometry.star_streak import fit_streak
+from namod_ctl.calibration.geometry.star_trail import fit_trail
+from namod_ctl.calibration.geometry.trail_frames import find_trail, trail_spots
+from namod_ctl.calibration.sky.star_path import path_of_declination
 from namod_ctl.core.errors import ConfigError, DataQualityError
 from namod_ctl.twin.settings import STAR_CAMERA
 from namod_ctl.twin.star_trail import TrailScene, TrailTwin

@@ -26,7 +26,7 @@ from namod_ctl.app.config.calibration_schema import AxisCalibration
 from namod_ctl.app.config.instrument import load_config
 from namod_ctl.app.pictures.axis_picture import draw_axis
 from namod_ctl.app.pictures.figure_style import figure_to_png
-from namod_ctl.calibration.optical_axis import AxisFit, AxisPosition, combine_axis
+from namod_ctl.calibration.geometry.optical_axis import AxisFit, AxisPosition, combine_axis
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.units import deg_to_rad, rad_to_arcmin, rad_to_deg

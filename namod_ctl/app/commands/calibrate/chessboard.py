@@ -25,7 +25,7 @@ from namod_ctl.app.config.instrument import load_config
 from namod_ctl.app.pictures.chessboard_picture import draw_chessboard
 from namod_ctl.app.pictures.figure_style import figure_to_png
 from namod_ctl.app.views.calibration_rows import values_in_words
-from namod_ctl.calibration.chessboard import BoardView, ChessboardFit, calibrate_with_boards, find_board
+from namod_ctl.calibration.geometry.chessboard import BoardView, ChessboardFit, calibrate_with_boards, find_board
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.errors import ConfigError, DataQualityError
 from namod_ctl.core.units import mm_to_m, rad_to_deg, rad_to_mdeg

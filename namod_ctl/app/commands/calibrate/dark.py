@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from namod_ctl.app.build.lamp_bench import TWIN_SEED, camera_at_bench, recording_range_s
+from namod_ctl.app.build.stored_lamp_series import read_stored_darks
 from namod_ctl.app.calibration_files import (
     DEFAULT_VALID_DAYS,
     check_calibration_output,
@@ -20,8 +21,7 @@ from namod_ctl.app.calibration_files import (
 from namod_ctl.app.commands.calibrate.radiometric import CalibratedCamera, Unit, ask, say
 from namod_ctl.app.config.calibration_schema import DarkCalibration
 from namod_ctl.app.config.instrument import load_config
-from namod_ctl.app.stored_lamp_series import read_stored_darks
-from namod_ctl.calibration.dark_frames import MIN_EXPOSURE_RATIO, DarkCamera, measure_dark_frames
+from namod_ctl.calibration.lamp.dark_frames import MIN_EXPOSURE_RATIO, DarkCamera, measure_dark_frames
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.cycle.lamp_recording import dark_exposures_s, record_darks
@@ -30,9 +30,11 @@ N_FRAMES = 5
 
 
 def dark(
-    camera: Annotated[CalibratedCamera, typer.Argument(metavar="CAMERA", help="star_camera or reflector_camera.")],
+    camera: Annotated[CalibratedCamera, typer.Argument(metavar="CAMERA", help="star or reflector.")],
     config: Annotated[str, typer.Option("--config", help="Instrument: a TOML file, or a built-in name.")] = "fact",
-    out: Annotated[Path | None, typer.Option("--out", help="Calibration file.  [default: CAMERA_dark.json]")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Calibration file.  [default: CAMERA_camera_dark.json]")
+    ] = None,
     frames: Annotated[
         Path | None,
         typer.Option("--frames", help="Folder of stored dark frames; with series.csv those that it calls dark."),
@@ -50,10 +52,10 @@ def dark(
 
     Frames with light in them are refused.
 
-    Example: namod-ctl calibrate dark star_camera --twin --out star_dark.json
+    Example: namod-ctl calibrate dark star --twin --out star_dark.json
     """
     loaded = load_config(config)
-    path = out or Path(f"{camera}_dark.json")
+    path = out or Path(f"{camera.role}_dark.json")
     if frames is not None and twin:
         raise ConfigError("--frames and --twin: choose one; stored frames need no twin")
     if frames is None and exposure_unit is not Unit.SECONDS:
@@ -66,7 +68,7 @@ def dark(
     else:
         if twin:
             say("Rehearsal on the digital twin.")
-        with camera_at_bench(loaded, camera.value, ask, is_twin=twin) as bench:
+        with camera_at_bench(loaded, camera.role, ask, is_twin=twin) as bench:
             bench.bench.cap()
             darks = record_darks(bench.camera, bench.clock, dark_exposures_s(bench.exposure_range_s), N_FRAMES)
         source = f"{len(darks)} frames of {'the twin with' if twin else 'the camera with'} its cap on"
@@ -74,7 +76,7 @@ def dark(
     limits = _limits(found)
     header = new_header(
         section,
-        camera.value,
+        camera.role,
         SystemClock(),
         source=source,
         verdict="limited" if limits else "good",

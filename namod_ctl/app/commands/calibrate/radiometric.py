@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import typer
 from rich.console import Console
 
 from namod_ctl.app.build.lamp_bench import TWIN_SEED, camera_at_bench, camera_model_of, recording_range_s
+from namod_ctl.app.build.stored_lamp_frames import ExposureUnit
+from namod_ctl.app.build.stored_lamp_series import read_stored_series
 from namod_ctl.app.calibration_files import (
     DEFAULT_VALID_DAYS,
     check_calibration_output,
@@ -23,13 +25,11 @@ from namod_ctl.app.config.calibration_schema import LawSection, RadiometricCalib
 from namod_ctl.app.config.instrument import InstrumentConfig, load_config
 from namod_ctl.app.pictures.figure_style import figure_to_png
 from namod_ctl.app.pictures.radiometric_plot import draw_radiometric
-from namod_ctl.app.stored_lamp_frames import ExposureUnit
-from namod_ctl.app.stored_lamp_series import read_stored_series
 from namod_ctl.app.views.radiometric_table import radiometric_table
-from namod_ctl.calibration.exposure_ratio import exposure_ratio
-from namod_ctl.calibration.lamp_series import Placement, at_distance, at_level
-from namod_ctl.calibration.lamp_visits import visits_of
-from namod_ctl.calibration.radiometric_verdict import RadiometricFinding, calibrate_radiometric
+from namod_ctl.calibration.lamp.exposure_ratio import exposure_ratio
+from namod_ctl.calibration.lamp.lamp_series import Placement, at_distance, at_level
+from namod_ctl.calibration.lamp.lamp_visits import visits_of
+from namod_ctl.calibration.lamp.radiometric_verdict import RadiometricFinding, calibrate_radiometric
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.cycle.lamp_recording import (
@@ -50,8 +50,13 @@ _Say = Callable[[str], None]
 class CalibratedCamera(StrEnum):
     """Cameras whose intensities the method uses."""
 
-    STAR = "star_camera"
-    REFLECTOR = "reflector_camera"
+    STAR = "star"
+    REFLECTOR = "reflector"
+
+    @property
+    def role(self) -> Literal["star_camera", "reflector_camera"]:
+        """Its section of the config."""
+        return "star_camera" if self is CalibratedCamera.STAR else "reflector_camera"
 
 
 class Unit(StrEnum):
@@ -63,11 +68,13 @@ class Unit(StrEnum):
 
 
 def radiometric(
-    camera: Annotated[CalibratedCamera, typer.Argument(metavar="CAMERA", help="star_camera or reflector_camera.")],
+    camera: Annotated[CalibratedCamera, typer.Argument(metavar="CAMERA", help="star or reflector.")],
     config: Annotated[str, typer.Option("--config", help="Instrument: a TOML file, or a built-in name.")] = "fact",
     out: Annotated[
         Path | None,
-        typer.Option("--out", help="Calibration file; its picture gets its name.  [default: CAMERA_radiometric.json]"),
+        typer.Option(
+            "--out", help="Calibration file; its picture gets its name.  [default: CAMERA_camera_radiometric.json]"
+        ),
     ] = None,
     frames: Annotated[
         Path | None,
@@ -100,10 +107,10 @@ def radiometric(
     automatic must be off. The program takes dark frames first, then chooses exposures itself and says where to put the
     lamp. Calibrate both cameras with the same lamp and distances: then their intensities have one scale.
 
-    Example: namod-ctl calibrate radiometric star_camera --twin --out star_radiometric.json
+    Example: namod-ctl calibrate radiometric star --twin --out star_radiometric.json
     """
     loaded = load_config(config)
-    path = out or Path(f"{camera}_radiometric.json")
+    path = out or Path(f"{camera.role}_radiometric.json")
     picture = path.with_suffix(".png")
     if frames is not None and twin:
         raise ConfigError("--frames and --twin: choose one; stored frames need no twin")
@@ -129,7 +136,7 @@ def radiometric(
     finding = calibrate_radiometric(series.responses, series.placements, series.dark, n_pixels, full_scale_adu)
     header = new_header(
         section,
-        camera.value,
+        camera.role,
         SystemClock(),
         source=source,
         verdict=finding.verdict,
@@ -139,9 +146,7 @@ def radiometric(
     )
     calibration = radiometric_calibration(finding, header)
     write_calibration(path, calibration, force=force)
-    write_file_durably(
-        picture, figure_to_png(draw_radiometric(finding, f"{section.model} ({camera.replace('_', ' ')})"))
-    )
+    write_file_durably(picture, figure_to_png(draw_radiometric(finding, f"{section.model} ({camera} camera)")))
     console = Console(highlight=False, markup=False, soft_wrap=True)
     before = section.radiometric_law
     console.print(radiometric_table(finding, (before.r_resp, before.r_expo, before.r_const)))
@@ -195,7 +200,7 @@ def _remarks(finding: RadiometricFinding) -> tuple[str, ...]:
 
 def _stored(folder: Path, config: InstrumentConfig, camera: CalibratedCamera, unit: Unit, say: _Say) -> LampSeries:
     section = config.star_camera if camera is CalibratedCamera.STAR else config.reflector_camera
-    model = camera_model_of(config, camera.value)
+    model = camera_model_of(config, camera.role)
     in_unit: ExposureUnit = unit.value
     return read_stored_series(folder, section, model, in_unit, recording_range_s(config), say)
 
@@ -222,7 +227,7 @@ def _recorded(
 ) -> LampSeries:
     if is_twin:
         say("Rehearsal on the digital twin: its lamp moves by itself.")
-    with camera_at_bench(config, camera.value, ask, is_twin=is_twin) as bench:
+    with camera_at_bench(config, camera.role, ask, is_twin=is_twin) as bench:
         law = bench.model.law
         plan = SeriesPlan(placements, bench.exposure_range_s, -law.r_expo / law.r_resp)
         say(f"{bench.camera.name}: dark frames first, then {len(placements) + 1} placements of the lamp")

@@ -28,10 +28,10 @@ from namod_ctl.app.config.instrument import InstrumentConfig, load_config
 from namod_ctl.app.pictures.figure_style import figure_to_png
 from namod_ctl.app.pictures.star_field_plot import draw_star_field
 from namod_ctl.app.views.star_field_table import geometry_table, star_table, where_it_looked
-from namod_ctl.calibration.field_geometry import FieldGeometry, Hint, Watch, solve_field
-from namod_ctl.calibration.observed_sky import Site
-from namod_ctl.calibration.star_catalogue import EPOCH_YEAR, bright_stars, number_of_star
-from namod_ctl.calibration.star_field import field_of_frames, stars_of_frame
+from namod_ctl.calibration.geometry.field_geometry import FieldGeometry, Hint, Watch, solve_field
+from namod_ctl.calibration.geometry.star_field import field_of_frames, stars_of_frame
+from namod_ctl.calibration.sky.observed_sky import Site
+from namod_ctl.calibration.sky.star_catalogue import EPOCH_YEAR, bright_stars, number_of_star
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.units import deg_to_rad, rad_to_deg, rad_to_mdeg

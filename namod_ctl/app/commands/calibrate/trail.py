@@ -29,12 +29,12 @@ from namod_ctl.app.config.instrument import InstrumentConfig, load_config
 from namod_ctl.app.pictures.figure_style import figure_to_png
 from namod_ctl.app.pictures.trail_picture import draw_trail
 from namod_ctl.app.views.calibration_rows import values_in_words
-from namod_ctl.calibration.observed_sky import Site, julian_year
-from namod_ctl.calibration.star_catalogue import bright_stars, number_of_star
-from namod_ctl.calibration.star_path import StarPath, apparent_path, path_of_declination, place_of_date
-from namod_ctl.calibration.star_streak import StreakFit, fit_streak
-from namod_ctl.calibration.star_trail import TrailFit, fit_trail
-from namod_ctl.calibration.trail_frames import FoundTrail, find_trail
+from namod_ctl.calibration.geometry.star_streak import StreakFit, fit_streak
+from namod_ctl.calibration.geometry.star_trail import TrailFit, fit_trail
+from namod_ctl.calibration.geometry.trail_frames import FoundTrail, find_trail
+from namod_ctl.calibration.sky.observed_sky import Site, julian_year
+from namod_ctl.calibration.sky.star_catalogue import bright_stars, number_of_star
+from namod_ctl.calibration.sky.star_path import StarPath, apparent_path, path_of_declination, place_of_date
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.errors import ConfigError, DataQualityError
 from namod_ctl.core.units import deg_to_rad, rad_to_deg, rad_to_mdeg

@@ -1,0 +1,1 @@
+"""How gravity turns facets over zenith distance, tables of corrections, and the scatter that is left."""
