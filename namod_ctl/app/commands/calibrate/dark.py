@@ -33,7 +33,7 @@ def dark(
     camera: Annotated[CalibratedCamera, typer.Argument(metavar="CAMERA", help="star or reflector.")],
     config: Annotated[str, typer.Option("--config", help="Instrument: a TOML file, or a built-in name.")] = "fact",
     out: Annotated[
-        Path | None, typer.Option("--out", help="Calibration file.  [default: CAMERA_camera_dark.json]")
+        Path | None, typer.Option("--out", help="Calibration file.  [default: star_camera_dark.json]")
     ] = None,
     frames: Annotated[
         Path | None,

@@ -73,7 +73,7 @@ def radiometric(
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out", help="Calibration file; its picture gets its name.  [default: CAMERA_camera_radiometric.json]"
+            "--out", help="Calibration file; its picture gets its name.  [default: star_camera_radiometric.json]"
         ),
     ] = None,
     frames: Annotated[
