@@ -7,8 +7,8 @@ generator of the tests, which throws rays; twin nights go through exposure loop,
 of the reflector camera's exposures is wrong, so the true slope of each night is worked out from the exposures it had:
 the same records with the wrong law divided out are measured again. Columns: `error` (rms over seeds) and `stated`
 uncertainty of the measured slope; what the self-calibration `left` of the true slope (rms, and the worst seed); by
-how much it `moved` the facets' centres (rms, and the most any facet moved) in their uncertainties per axis; and the
-centres' errors against the truth with the self-calibration off and on, arcmin rms per axis.
+how much it `moved` the facets' centres (rms, and the most any facet moved) in their stated uncertainties per axis; and
+the centres' errors against the truth with the self-calibration off and on, arcmin rms per axis.
 """
 
 from __future__ import annotations
@@ -28,12 +28,9 @@ from namod_ctl.app.config.instrument import load_config
 from namod_ctl.core.units import arcmin_to_rad, deg_to_rad, rad_to_arcmin
 from namod_ctl.cycle.record import Equipment, Recorder, RecordSettings, StopRule
 from namod_ctl.optics.instrument import Instrument
-from namod_ctl.reconstruction.facet_fit import centre_covariance
-from namod_ctl.reconstruction.facet_psf import CENTRE
 from namod_ctl.reconstruction.normalization import PER_MAGNITUDE
-from namod_ctl.reconstruction.reconstruct import fit_run
+from namod_ctl.reconstruction.reconstruct import fit_run, reconstruct
 from namod_ctl.reconstruction.responses import ResponseTable, tabulate_responses
-from namod_ctl.reconstruction.uncertainty import misfit_factors
 from namod_ctl.store.run import RunStore
 from namod_ctl.twin.settings import (
     REFLECTOR_CAMERA,
@@ -71,14 +68,15 @@ class Night:
 
 def judge(table: ResponseTable, telescope: Instrument, true_exponent: float, centre_rad: np.ndarray) -> Night | None:
     """None where the run carries too little information."""
-    on, off = (fit_run(table, telescope, self_calibration=is_on) for is_on in (True, False))
+    on, off = (reconstruct(table, telescope, self_calibration=is_on) for is_on in (True, False))
     found = on.normalization
     if not found.is_known:
         return None
-    here, there = (np.array([fit.parameters[CENTRE] for fit in run.fits if fit is not None]) for run in (on, off))
-    factors = misfit_factors(on.fits)
-    cov = [factors[j] * centre_covariance(fit) for j, fit in enumerate(on.fits) if fit is not None]
-    sigma = np.sqrt(np.trace(np.array(cov), axis1=1, axis2=2) / 2.0)
+    here, there = (np.array([facet.theta_rad for facet in run.alignment.facets]) for run in (on, off))
+    cov = np.array([facet.theta_cov_rad2 for facet in on.alignment.facets])
+    known = np.isfinite(here).all(axis=1) & np.isfinite(there).all(axis=1) & np.isfinite(cov).all(axis=(1, 2))
+    here, there, cov, centre_rad = here[known], there[known], cov[known], centre_rad[known]
+    sigma = np.sqrt(np.trace(cov, axis1=1, axis2=2) / 2.0)
     moved = np.linalg.norm(here - there, axis=1) / sigma
     return Night(
         true=100.0 * math.expm1(PER_MAGNITUDE * true_exponent),

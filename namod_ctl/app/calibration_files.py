@@ -43,8 +43,7 @@ def new_header(
     ConfigError
         `valid_days` is no sensible time.
     """
-    if not 0.0 < valid_days <= MAX_VALID_DAYS:
-        raise ConfigError(f"--valid-days {valid_days:g}: must be more than 0 and at most {MAX_VALID_DAYS:g} days")
+    check_valid_days(valid_days)
     now = clock.now()
     return {
         "camera": role,
@@ -59,6 +58,12 @@ def new_header(
         "verdict": verdict,
         "remarks": remarks,
     }
+
+
+def check_valid_days(valid_days: float) -> None:
+    """Raise ConfigError for what is no sensible time; call it before hours of measuring."""
+    if not 0.0 < valid_days <= MAX_VALID_DAYS:
+        raise ConfigError(f"--valid-days {valid_days:g}: must be more than 0 and at most {MAX_VALID_DAYS:g} days")
 
 
 def check_calibration_output(path: Path, *, force: bool) -> None:

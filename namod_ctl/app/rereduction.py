@@ -56,7 +56,10 @@ def recalibrated_config(
         kinds = {calibration.kind for calibration in new[role]}
         kept = [calibration for calibration in calibrations_of(section) if calibration.kind not in kinds]
         changed = section.model_copy(
-            update={"calibrations": (*kept, *new[role]), "accept_calibrations": accepted or section.accept_calibrations}
+            update={
+                "calibrations": (*kept, *new[role]),
+                "accept_calibrations": tuple(sorted({*accepted, *(section.accept_calibrations or ())})) or None,
+            }
         )
         update[role] = changed
         problems += [f"{role}: {problem}" for problem in calibration_problems(changed, role, recorded)]

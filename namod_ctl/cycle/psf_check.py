@@ -34,6 +34,7 @@ TARGET_SHARE, LEAST_SHARE = 0.7, 0.35
 MORE_ATTEMPTS = 12
 """Than frames are wanted: to find the exposure, and for frames without a usable spot."""
 AGREE_SIGMAS = 2.5
+MOST_DIGITS = 4
 METHODS_SHARE = 0.04
 """Of the area: what two methods differ by that look at other moments and through another opening; on the twin up to
 5 %, where both are known to be right to a few per cent."""
@@ -136,9 +137,13 @@ class Comparison:
 
     @property
     def sigmas(self) -> float:
-        """Difference in units of its uncertainty, positive where the camera sees the larger area."""
+        """Difference in units of its uncertainty, positive where the camera sees the larger area.
+
+        Estimators of other programs state no uncertainty (NaN): then that of the methods stands for it.
+        """
         methods_rad2 = METHODS_SHARE * self.estimate_rad2
-        doubt = math.hypot(self.uncertainty_rad2, self.estimate_uncertainty_rad2, methods_rad2)
+        stated = [u for u in (self.uncertainty_rad2, self.estimate_uncertainty_rad2) if math.isfinite(u)]
+        doubt = math.hypot(*stated, methods_rad2)
         return (self.a_sigma_rad2 - self.estimate_rad2) / doubt
 
     @property
@@ -202,7 +207,9 @@ def check_psf(store: CampaignStore, open_equipment: OpenPsfEquipment | None, whe
         data |= {
             "cycle": cycle.number,
             "estimate_rad2": cycle.a_sigma_now_rad2,
-            "estimate_uncertainty_rad2": cycle.a_sigma_uncertainty_rad2,
+            "estimate_uncertainty_rad2": (
+                cycle.a_sigma_uncertainty_rad2 if math.isfinite(cycle.a_sigma_uncertainty_rad2) else None
+            ),
             "difference_sigmas": compared.sigmas,
         }
     for remark in psf.remarks:
@@ -228,4 +235,10 @@ def _comparable_cycle(store: CampaignStore) -> Cycle | None:
 
 
 def _area_text(area_rad2: float, uncertainty_rad2: float) -> str:
-    return f"{rad2_to_arcmin2(area_rad2):.2f} +- {rad2_to_arcmin2(uncertainty_rad2):.2f} arcmin2"
+    area, uncertainty = rad2_to_arcmin2(area_rad2), rad2_to_arcmin2(uncertainty_rad2)
+    if not math.isfinite(uncertainty):
+        return f"{area:.2f} arcmin2 (uncertainty not stated)"
+    if not uncertainty > 0.0:
+        return f"{area:.2f} arcmin2"
+    digits = min(max(2, -math.floor(math.log10(uncertainty))), MOST_DIGITS)
+    return f"{area:.{digits}f} +- {uncertainty:.{digits}f} arcmin2"

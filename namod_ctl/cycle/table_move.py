@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import TypeGuard
 
 from namod_ctl.core.drives import Drive, DriveState, Leg
 from namod_ctl.core.errors import StoreError
-from namod_ctl.core.motion import MoveOrder
+from namod_ctl.core.motion import MoveOrder, MoveOutcome
 from namod_ctl.core.motion_settings import MotionSettings
 from namod_ctl.core.units import deg_to_rad, m_to_mm, rad_to_deg
 from namod_ctl.cycle.leg_course import refusal
@@ -114,14 +114,24 @@ def moved_legs(
     ]
 
 
+def halted_legs(store: CampaignStore) -> frozenset[Leg]:
+    """Legs whose last order did not end at its target: they may stand near it, and yet their play is not taken up."""
+    last = {journaled.order.leg: journaled.result for journaled in store.orders()}
+    return frozenset(leg for leg, result in last.items() if result is None or result.outcome is not MoveOutcome.ARRIVED)
+
+
 def plan_table_move(
     travels_m: Mapping[Leg, float],
     baseline: Baseline,
     states: Mapping[Leg, DriveState | str],
     drives: Mapping[Leg, Drive],
     settings: MotionSettings,
+    halted: Collection[Leg] = (),
 ) -> TablePlan:
-    """Orders that bring each leg `travels_m` from its baseline. A facet moves by all of its legs or not at all."""
+    """Orders that bring each leg `travels_m` from its baseline. A facet moves by all of its legs or not at all.
+
+    Of `halted` legs no way is too short, down to the last step of the drive.
+    """
     orders: list[MoveOrder] = []
     refused: dict[int, str] = {}
     turned: list[int] = []
@@ -143,16 +153,22 @@ def plan_table_move(
         if reasons:
             refused[facet_id] = "; ".join(reasons)
             continue
-        moving = [o for o in wanted if abs(o.target_m - o.start_m) > _least_way_m(drives[o.leg], settings)]
+        moving = [
+            order
+            for order in wanted
+            if abs(order.target_m - order.start_m)
+            > _least_way_m(drives[order.leg], settings, was_halted=order.leg in halted)
+        ]
         if moving:
             turned.append(facet_id)
             orders += moving
     return TablePlan(tuple(orders), tuple(turned), refused)
 
 
-def _least_way_m(drive: Drive, settings: MotionSettings) -> float:
+def _least_way_m(drive: Drive, settings: MotionSettings, *, was_halted: bool) -> float:
     """A shorter way is none: the drive stands as near to its target as it would after another move."""
-    return max(drive.resolution_m / 2.0, settings.arrival_tolerance_m)
+    step_m = drive.resolution_m / 2.0
+    return step_m if was_halted else max(step_m, settings.arrival_tolerance_m)
 
 
 def _is_known(state: DriveState | str) -> TypeGuard[DriveState]:

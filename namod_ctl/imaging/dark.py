@@ -6,6 +6,7 @@ changes its input.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -104,9 +105,10 @@ def subtract_dark(frame: Frame, dark: Dark, saturation_adu: float) -> Frame:
 def subtract_dark_model(frame: Frame, dark: DarkModel, exposure_s: float, saturation_adu: float) -> Frame:
     """What `subtract_dark` makes of a frame, by the camera's dark model instead of dark frames.
 
-    The level is rounded to whole numbers, as the frame is. Hot pixels are of the whole image, in all channels.
+    Whole numbers are taken off, as frames are of such; `dark_rest_adu` is what remains for the intensities. Hot pixels
+    are of the whole image, in all channels.
     """
-    level = round(dark.level_adu(exposure_s))
+    level = max(math.floor(dark.level_adu(exposure_s)), 0)
     if level > 0:
         subtracted: Frame = cv2.subtract(frame, np.full_like(frame, level))
         np.copyto(subtracted, frame, where=frame >= saturation_adu)
@@ -115,6 +117,16 @@ def subtract_dark_model(frame: Frame, dark: DarkModel, exposure_s: float, satura
         return frame
     is_hot, positions = _hot_in_frame(dark, frame.shape)
     return _repaired(frame, is_hot, positions)
+
+
+def dark_rest_adu(dark: DarkModel, exposure_s: float) -> float:
+    """What a frame that `subtract_dark_model` left still shows without light, for `radiometry.response_table`.
+
+    0 to 1 adu, so that the responses that became 0 are just those at or below the dark level; below 0 where the camera
+    itself cuts responses off that are near its dark level.
+    """
+    level = dark.level_adu(exposure_s)
+    return level - max(math.floor(level), 0)
 
 
 @lru_cache(maxsize=8)

@@ -95,8 +95,13 @@ class FacetPhotometer:
             self._plans[n_channels, block] = [_planned([samples[i] for i in group], block) for group in self._groups]
         return self._plans[n_channels, block]
 
-    def measure(self, frame: Frame, camera: CameraModel, exposure_s: float) -> FacetLight:
+    def measure(self, frame: Frame, camera: CameraModel, exposure_s: float, rest_adu: float = 0.0) -> FacetLight:
         """The facets' light in a frame, shape (rows, columns) or (rows, columns, 3), of the reflector camera.
+
+        Parameters
+        ----------
+        rest_adu
+            What the frame still shows without light (`dark.dark_rest_adu`).
 
         Raises
         ------
@@ -106,7 +111,7 @@ class FacetPhotometer:
         frame = checked_frame(frame, camera)
         factor = exposure_factor(camera.law, exposure_s)
         n_channels = 1 if frame.ndim == 2 else N_COLOURS
-        table = response_table(camera, frame.dtype)
+        table = response_table(camera, frame.dtype, rest_adu)
         samples = frame.reshape(-1)
         block = BLOCK_BYTES // frame.dtype.itemsize
         blocks = samples[: samples.size // block * block].view(f"V{BLOCK_BYTES}")

@@ -6,7 +6,7 @@ import numpy as np
 
 from namod_ctl.core.flags import RejectReason
 from namod_ctl.core.records import Record
-from namod_ctl.imaging.dark import Dark, subtract_dark, subtract_dark_model
+from namod_ctl.imaging.dark import Dark, dark_rest_adu, subtract_dark, subtract_dark_model
 from namod_ctl.imaging.facets import FacetLight, FacetPhotometer
 from namod_ctl.imaging.radiometry import Frame, checked_frame, exposure_factor, grey_frame, saturation_adu
 from namod_ctl.imaging.star import Star, StarRejection, star_finder
@@ -57,7 +57,10 @@ def measure_record(
     star = _star(star_frame, star_exposure_s, instrument, star_dark)
     camera = instrument.reflector_camera
     light = photometer.measure(
-        without_dark(reflector_frame, camera, reflector_exposure_s, reflector_dark), camera, reflector_exposure_s
+        without_dark(reflector_frame, camera, reflector_exposure_s, reflector_dark),
+        camera,
+        reflector_exposure_s,
+        _rest_adu(camera, reflector_exposure_s, reflector_dark),
     )
     saturated = _saturated_facets(light, photometer)
     reason: RejectReason | None = None
@@ -90,7 +93,13 @@ def _star(frame: Frame, exposure_s: float, instrument: Instrument, dark: Dark | 
     camera = instrument.star_camera
     exposure_factor(camera.law, exposure_s)
     grey = grey_frame(without_dark(frame, camera, exposure_s, dark), saturation_adu(camera))
-    return star_finder(camera, instrument.star_size_rad, grey.dtype).find(grey)
+    rest_adu = _rest_adu(camera, exposure_s, dark)
+    return star_finder(camera, instrument.star_size_rad, grey.dtype, rest_adu).find(grey)
+
+
+def _rest_adu(camera: CameraModel, exposure_s: float, dark: Dark | None) -> float:
+    """What a frame that `without_dark` gives still shows without light."""
+    return dark_rest_adu(camera.dark, exposure_s) if dark is None and camera.dark is not None else 0.0
 
 
 def without_dark(frame: Frame, camera: CameraModel, exposure_s: float, dark: Dark | None = None) -> Frame:

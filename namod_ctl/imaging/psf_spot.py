@@ -108,15 +108,26 @@ class SpotPlace:
 
 
 def light_image(frame: Frame, camera: CameraModel, exposure_s: float) -> LightImage:
-    """The frame of `camera` as linear light. Raises ConfigError when it is no frame of the camera."""
+    """The frame of `camera` as linear light.
+
+    Raises
+    ------
+    ConfigError
+        It is no frame of the camera.
+    DataQualityError
+        It is saturated almost all over.
+    """
     frame = checked_frame(frame, camera)
     is_bad = _bad_pixels(frame)
     if camera.dark is not None and len(camera.dark.hot_pixels):
         is_bad[camera.dark.hot_pixels[:, 1], camera.dark.hot_pixels[:, 0]] = True
-    if is_bad.any():
-        frame = repair_pixels(frame, is_bad)
     is_colour = frame.ndim == N_COLOURS
+    if is_bad.any():
+        frame = repair_pixels(frame, np.repeat(is_bad[..., None], N_COLOURS, axis=2) if is_colour else is_bad)
     brightest = frame.max(axis=2) if is_colour else frame
+    is_saturated = brightest >= saturation_adu(camera)
+    if is_saturated.mean() > 0.5:
+        raise DataQualityError("most of the image is saturated: expose shorter, and darken the screen's surroundings")
     level_adu = 0.0
     if camera.dark is not None:  # frames of other programs may not tell their exposures
         level_adu = camera.dark.level_adu(exposure_s if np.isfinite(exposure_s) else 0.0)
@@ -129,7 +140,7 @@ def light_image(frame: Frame, camera: CameraModel, exposure_s: float) -> LightIm
         light = np.sign(away) * np.interp(np.abs(away), np.arange(len(table)), table)
     return LightImage(
         light=light.mean(axis=2) if is_colour else light,
-        is_saturated=brightest >= saturation_adu(camera),
+        is_saturated=is_saturated,
         is_zero=(frame == 0).any(axis=2) if is_colour else frame == 0,
         peak_share=float(brightest.max()) / camera.full_scale_adu,
     )

@@ -79,18 +79,24 @@ def saturation_adu(camera: CameraModel) -> float:
     return camera.saturation_share * camera.full_scale_adu
 
 
-def response_table(camera: CameraModel, dtype: np.dtype[Any]) -> Array:
+def response_table(camera: CameraModel, dtype: np.dtype[Any], rest_adu: float = 0.0) -> Array:
     """C**(r_resp + r_curve log10 C) for every response a frame of that type can hold, (256,) or (65536,), read-only.
 
     Multiply by `exposure_factor` for intensities. No response is no intensity. Responses above full scale count as
     full scale: there the law has no meaning, and they are saturated anyway.
+
+    Parameters
+    ----------
+    rest_adu
+        What all responses of the frame still show without light, -100 to 1 (`dark.dark_rest_adu`).
     """
-    return _response_table(camera.law.r_resp, camera.law.r_curve, camera.full_scale_adu, int(np.iinfo(dtype).max) + 1)
+    law, n_levels = camera.law, int(np.iinfo(dtype).max) + 1
+    return _response_table(law.r_resp, law.r_curve, camera.full_scale_adu, n_levels, rest_adu)
 
 
 @lru_cache(maxsize=16)
-def _response_table(r_resp: float, r_curve: float, full_scale_adu: float, n_levels: int) -> Array:
-    share = np.minimum(np.arange(1, n_levels) / full_scale_adu, 1.0)
+def _response_table(r_resp: float, r_curve: float, full_scale_adu: float, n_levels: int, rest_adu: float) -> Array:
+    share = np.minimum((np.arange(1, n_levels) - rest_adu) / full_scale_adu, 1.0)
     table = np.zeros(n_levels)
     table[1:] = share ** (r_resp if r_curve == 0.0 else r_resp + r_curve * np.log10(share))
     table.setflags(write=False)

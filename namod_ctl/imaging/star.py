@@ -257,13 +257,16 @@ class StarFinder:
         )
 
 
-def star_finder(camera: CameraModel, star_size_rad: float, dtype: np.dtype[Any]) -> StarFinder:
-    """The finder for frames of that type of a camera in which a star is `star_size_rad` wide."""
+def star_finder(camera: CameraModel, star_size_rad: float, dtype: np.dtype[Any], rest_adu: float = 0.0) -> StarFinder:
+    """The finder for frames of that type of a camera in which a star is `star_size_rad` wide.
+
+    `rest_adu` is what the frames still show without light (`dark.dark_rest_adu`).
+    """
     return StarFinder(
         star_size_px=star_size_rad / camera.plate_scale_rad,
         full_scale_adu=camera.full_scale_adu,
         saturation_adu=saturation_adu(camera),
-        table=response_table(camera, dtype),
+        table=response_table(camera, dtype, rest_adu),
     )
 
 

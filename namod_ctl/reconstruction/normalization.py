@@ -50,6 +50,8 @@ MIN_RANGE_MAG = 0.3
 GOOD_PER_MAGNITUDE = 0.01
 """Slopes that are known better are known well; a slope below is harmless."""
 
+_SMOOTH_DEGREE = 4  # of a light's shape beyond a gaussian's: its tails and its skewness
+_SHAPE_ERROR = 0.1  # of a response, by which a gaussian may be wrong at any one direction
 _LIT = 0.1  # share of a facet's scale from which on its light is far above what else it shows
 _MIN_INFORMATION = 10.0  # records whose common factor is less certain than 0.3 say nothing
 _MIN_LIT_RECORDS = 20
@@ -61,6 +63,7 @@ _MIN_STRENGTH = 5.0  # sigma by which neighbours must tell a record's intensity
 _SIGNIFICANT_SIGMA, _SIGNIFICANT_PER_MAGNITUDE = 3.0, 0.005
 _MAX_EXPONENT = 0.5  # beyond, it is no calibration that is imperfect: something else is wrong
 _MAX_BIAS = 0.02
+_SELF_CALIBRATION = "self-calibration"
 _MAX_SIGMA = 0.035  # of the exponent: a slope like FACT's could not be seen beyond
 
 
@@ -177,9 +180,15 @@ def slope_in_words(normalization: Normalization) -> str:
 def removal_in_words(normalization: Normalization) -> str:
     """What a self-calibration did."""
     return (
-        f"self-calibration: responses changed by {slope_in_words(normalization)} with the star's intensity, and that "
-        "is taken out of them: the two cameras' radiometric calibrations do not match (namod-ctl calibrate radiometric)"
+        f"{_SELF_CALIBRATION}: responses changed by {slope_in_words(normalization)} with the star's intensity, and "
+        "that is taken out of them: the two cameras' radiometric calibrations do not match "
+        "(namod-ctl calibrate radiometric)"
     )
+
+
+def is_self_calibrated(remarks: Sequence[str]) -> bool:
+    """True when these remarks of a reconstruction say that a self-calibration took a slope out."""
+    return any(remark.startswith(f"{_SELF_CALIBRATION}:") for remark in remarks)
 
 
 def without_slope(table: ResponseTable, exponent: float) -> ResponseTable:
@@ -193,7 +202,14 @@ def measure_normalization(table: ResponseTable, fits: Sequence[FacetFit | None])
     It is linear: how far the fits themselves would follow a removed exponent, new fits must tell (`with_refits`).
     """
     witnesses = [_witness_of(table, fit) for j, fit in enumerate(fits) if fit is not None and has_signal(fit, table, j)]
-    return normalization_of(witnesses, table.record_index, table.faintness)
+    return normalization_of(witnesses, table.record_index, table.faintness, _smooth_columns(table.theta_rad))
+
+
+def _smooth_columns(theta_rad: Array) -> Array:
+    """Polynomials of the records' directions without the constant, which is each facet's flux, shape (n, k)."""
+    x, y = theta_rad.T / max(float(np.abs(theta_rad).max(initial=0.0)), 1e-12)
+    powers = [(i, order - i) for order in range(1, _SMOOTH_DEGREE + 1) for i in range(order + 1)]
+    return np.stack([x**i * y**j for i, j in powers], axis=1)
 
 
 def centre_shift_per_exponent(table: ResponseTable, fit: FacetFit) -> Array:
@@ -211,35 +227,43 @@ def measure_at_rest(table: ResponseTable) -> Normalization:
     The table must be made with `is_at_rest`. Only well lit facets have a say, so that the scene does not matter.
     """
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # a facet that was never measured stays NaN
+        warnings.simplefilter("ignore", RuntimeWarning)  # a facet, or a record, that was never measured stays NaN
         typical = np.nan_to_num(np.nanmedian(table.response, axis=0))
+        bright = table.response[:, typical > max(_BRIGHT * typical.max(initial=0.0), 0.0)]
+        log_response = np.log(np.where(bright > 0.0, bright, np.nan))
+        away = log_response - np.nanmedian(log_response, axis=0)
+        own = away - np.nanmedian(away, axis=1, keepdims=True)  # what it does not have in common with the others
     witnesses = []
-    for j in np.flatnonzero(typical > max(_BRIGHT * typical.max(initial=0.0), 0.0)):
-        records = np.flatnonzero(np.nan_to_num(table.response[:, j]) > 0.0)
-        log_response = np.log(table.response[records, j])
-        residual = log_response - np.median(log_response)
+    for j in range(away.shape[1]):
+        records = np.flatnonzero(np.isfinite(away[:, j]))
+        residual = away[records, j]
         n = len(records)
-        sigma = max(_MAD_TO_SIGMA * float(np.median(np.abs(residual))), _LEAST_SCATTER)
+        spread = np.abs(own[records, j] - np.median(own[records, j]))
+        sigma = max(_MAD_TO_SIGMA * float(np.median(spread)), _LEAST_SCATTER)
         witnesses.append(
             Witness(
                 records=records,
                 residual=residual,
                 variance=np.full(n, sigma**2),
                 gain=np.ones(n),
-                leverage=np.full(n, 1.0 / max(n, 2)),
                 free=np.ones((n, 1)),
                 belief=np.zeros((1, 1)),
                 belief_pull=np.zeros(1),
             )
         )
-    return normalization_of(witnesses, table.record_index, table.faintness)
+    return normalization_of(witnesses, table.record_index, table.faintness, np.zeros((table.n_records, 0)))
 
 
-def normalization_of(witnesses: Sequence[Witness], record_index: NDArray[np.int64], faintness: Array) -> Normalization:
-    """The exponent that makes all witnesses agree best; `faintness` (n_records,) as in the response table."""
+def normalization_of(
+    witnesses: Sequence[Witness], record_index: NDArray[np.int64], faintness: Array, smooth: Array
+) -> Normalization:
+    """The exponent that makes all witnesses agree best.
+
+    `faintness` (n_records,) as in the response table, `smooth` (n_records, k) as in `common_exponent.solve`.
+    """
     log_star = -np.log(faintness)
     n = len(log_star)
-    factor, information = common_factors(witnesses, [w.residual for w in witnesses], n)
+    factor, information = common_factors(witnesses, n)
     lit = np.flatnonzero(information > _MIN_INFORMATION)
     told = told_by_neighbours(log_star)
     range_mag, direct_range_mag = (_range_mag(column[lit]) for column in (told, log_star))
@@ -252,14 +276,13 @@ def normalization_of(witnesses: Sequence[Witness], record_index: NDArray[np.int6
         doubt = f"facets are lit in {len(lit)} records only, {_MIN_LIT_RECORDS} are needed: record longer"
     else:
         if range_mag >= MIN_RANGE_MAG:
-            solution = solve(witnesses, log_star, told)
+            solution = solve(witnesses, log_star, told, smooth)
             if solution.strength < _MIN_STRENGTH:
                 solution = None
         if solution is None and direct_range_mag >= MIN_RANGE_MAG:
             # Light that jumps from record to record: the scatter bounds what the noise of its intensity can do.
-            direct = solve(witnesses, log_star, log_star)
-            noise, _ = common_factors(witnesses, direct.lefts, n)
-            bias = float(np.var(noise[lit]) / np.var(log_star[lit]))
+            direct = solve(witnesses, log_star, log_star, smooth)
+            bias = float(np.var(direct.factor[lit]) / np.var(log_star[lit]))
             if bias < _MAX_BIAS:
                 range_mag, told = direct_range_mag, log_star
                 solution = replace(direct, sigma=math.hypot(direct.sigma, bias))
@@ -268,8 +291,7 @@ def normalization_of(witnesses: Sequence[Witness], record_index: NDArray[np.int6
         else:
             doubt = _doubt(math.nan if solution is None else solution.sigma, range_mag)
     if solution is not None:
-        factor, information = common_factors(witnesses, solution.lefts, n)
-        factor += solution.exponent * log_star
+        factor = solution.factor + solution.exponent * log_star
     return Normalization(
         math.nan if solution is None else solution.exponent,
         math.nan if solution is None else solution.sigma,
@@ -320,4 +342,5 @@ def _witness_of(table: ResponseTable, fit: FacetFit) -> Witness:
     # A facet's flux is taken as it comes: what its family expects of it must not look like a slope.
     belief[LOG_FLUX], belief[:, LOG_FLUX], pull[LOG_FLUX] = 0.0, 0.0, 0.0
     gain = free[:, LOG_FLUX]
-    return Witness(records, fit.residual[lit], fit.variance[lit], gain, fit.leverage[lit], free, belief, pull)
+    variance = fit.variance[lit] + (_SHAPE_ERROR * gain) ** 2
+    return Witness(records, fit.residual[lit], variance, gain, free, belief, pull)

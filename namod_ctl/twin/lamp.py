@@ -47,6 +47,8 @@ class LampSettings:
         Standard deviation of the true light of a placement about what the person believes.
     distance_error_m
         The same of the distance.
+    distance_offset_m
+        True distances are larger by this than what the person believes, all of them.
     radius_share
         Radius of the lit disc as a share of the image's height; None lights the whole field.
     fall_off_share
@@ -62,6 +64,7 @@ class LampSettings:
     drift_share_per_hour: float = 0.0
     level_error_share: float = 0.0
     distance_error_m: float = 0.0
+    distance_offset_m: float = 0.0
     radius_share: float | None = None
     fall_off_share: float = 0.1
     dark_rate_adu_per_s: float = 0.0
@@ -131,7 +134,7 @@ class TwinLamp:
     def place(self, distance_m: float) -> None:
         """Put the lamp so far from the diffuser, as well as a person can."""
         rng = self._moved()
-        true_m = distance_m + self._lamp.distance_error_m * rng.standard_normal()
+        true_m = distance_m + self._lamp.distance_offset_m + self._lamp.distance_error_m * rng.standard_normal()
         self._light = self._lamp.intensity_at_1m / true_m**2 * self._level_error(rng)
 
     def set_level(self, level: float) -> None:

@@ -74,8 +74,8 @@ def read_gravity_runs(
     Raises
     ------
     ConfigError
-        No runs, not reconstructed, named twice, of several telescopes, of a campaign that corrected between them, or
-        of unknown zenith distance.
+        No runs, not reconstructed, named twice, copies of one another, of several telescopes, of a campaign that
+        corrected between them, or of unknown zenith distance.
     """
     folders = [folder.resolve() for folder in folders]
     twice = sorted({str(folder) for folder in folders if folders.count(folder) > 1})
@@ -88,6 +88,7 @@ def read_gravity_runs(
     instrument = read[0].instrument
     for folder, one in zip(folders, read, strict=True):
         _refuse_other_telescope(folders[0], instrument, folder, one.instrument)
+    _refuse_copies(folders, [one.alignment for one in read])
     facet_ids = instrument.reflector.ids
     names = _names(folders)
     runs = []
@@ -157,6 +158,20 @@ def _refuse_other_telescope(first: Path, instrument: Instrument, folder: Path, o
             f"{folder}: is a run of {other.name}, with other facets than {first} of {instrument.name}; name runs of "
             "one telescope"
         )
+
+
+def _refuse_copies(folders: Sequence[Path], alignments: Sequence[Alignment]) -> None:
+    """Raise ConfigError for two runs with the very same estimates: noise makes every run its own."""
+    first_of: dict[tuple[tuple[int, float, float], ...], Path] = {}
+    for folder, alignment in zip(folders, alignments, strict=True):
+        finite = [facet for facet in alignment.facets if np.isfinite(facet.theta_rad).all()]
+        found = tuple((facet.facet_id, float(facet.theta_rad[0]), float(facet.theta_rad[1])) for facet in finite)
+        if found and found in first_of:
+            raise ConfigError(
+                f"{folder}: has the very same estimates as {first_of[found]}, so it is a copy of that run; name each "
+                "run once"
+            )
+        first_of[found] = folder
 
 
 def _refuse_corrected(folders: Sequence[Path]) -> None:

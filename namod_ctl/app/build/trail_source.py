@@ -16,7 +16,7 @@ from namod_ctl.calibration.geometry.trail_frames import TrailSpot, trail_spots
 from namod_ctl.calibration.sky.observed_sky import Site
 from namod_ctl.calibration.sky.star_path import place_of_date
 from namod_ctl.core.clock import Clock
-from namod_ctl.core.errors import ConfigError
+from namod_ctl.core.errors import ConfigError, DataQualityError
 from namod_ctl.core.units import deg_to_rad
 from namod_ctl.optics.camera_model import CameraModel, Distortion
 from namod_ctl.optics.coordinates import CameraOrientation
@@ -78,6 +78,9 @@ def stored_sightings(series: FrameSeries, camera: CameraModel, star_size_rad: fl
             spots = trail_spots(frame.image, camera, star_size_rad, frame.exposure_s)
         except ConfigError as error:
             raise ConfigError(f"{frame.name}: {error}") from None
+        except DataQualityError as error:
+            series.problems.append(f"{frame.name}: {error}")
+            continue
         time_s = math.nan if frame.time_s is None else frame.time_s
         image = frame.image if n_seen == 1 else None
         yield Sighting(frame.name, frame.exposure_s, time_s, frame.utc, frame.rough_utc, tuple(spots), image)
@@ -99,7 +102,10 @@ def live_sightings(chosen: ChosenCamera, clock: Clock, duration_s: float, every_
         if look.exposure is None:
             continue
         exposure = look.exposure
-        spots = trail_spots(exposure.image, chosen.model, chosen.star_size_rad, exposure.exposure_s)
+        try:
+            spots = trail_spots(exposure.image, chosen.model, chosen.star_size_rad, exposure.exposure_s)
+        except DataQualityError:
+            spots = []  # counts as a frame without a star
         utc = zero + timedelta(seconds=exposure.mid_exposure_s)
         yield Sighting(
             f"frame {number + 1}", exposure.exposure_s, exposure.mid_exposure_s, utc, utc, tuple(spots), None

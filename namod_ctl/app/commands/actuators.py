@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from types import FrameType
 from typing import Annotated
 
 import typer
@@ -18,6 +16,7 @@ from rich.text import Text
 from namod_ctl.app.build.actuators import build_bus_settings, build_motion_settings, open_actuators
 from namod_ctl.app.build.twin_actuators import build_twin_actuators, twin_wiring
 from namod_ctl.app.config.instrument import InstrumentConfig, load_config
+from namod_ctl.app.end_signals import ended_in_order
 from namod_ctl.app.views.actuator_tables import (
     identity_lines,
     legs_named,
@@ -308,7 +307,7 @@ def _execute(rig: _Rig, orders: Sequence[MoveOrder]) -> list[MoveResult]:
 
 @contextmanager
 def _rig(config: str, *, is_twin: bool) -> Iterator[_Rig]:
-    """The drives of a config, or of a twin of it, and a mover; SIGTERM stops as Ctrl-C does."""
+    """The drives of a config, or of a twin of it, and a mover; signals that end the program stop as Ctrl-C does."""
     loaded = load_config(config)
     settings = build_motion_settings(loaded)
     console = Console(highlight=False)
@@ -329,23 +328,11 @@ def _rig(config: str, *, is_twin: bool) -> Iterator[_Rig]:
             if bus.unreachable:
                 legs = legs_in_words(bus.unreachable)
                 console.print(Text(f"{bus.name}: no proper answer from {legs}", style="yellow"), soft_wrap=True)
-        stack.enter_context(_ended_by_sigterm())
+        stack.enter_context(ended_in_order())
         prefix = "twin/" if is_twin else ""
         bus_names = {drive.leg: f"{prefix}{bus.name}" for bus in build_bus_settings(loaded) for drive in bus.drives}
         drives_of_legs = {leg: drive for bus in buses for leg, drive in bus.drives.items()}
         yield _Rig(Mover(buses, clock, settings, StopSwitch()), settings, console, bus_names, drives_of_legs)
-
-
-@contextmanager
-def _ended_by_sigterm() -> Iterator[None]:
-    def leave(number: int, frame: FrameType | None) -> None:
-        raise SystemExit(128 + number)
-
-    before = signal.signal(signal.SIGTERM, leave)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _refuse_no_number(option: str, length_mm: float) -> None:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -24,6 +23,7 @@ from namod_ctl.app.build.twin_note import note_twin, noted_twin
 from namod_ctl.app.campaign_report import write_campaign_report
 from namod_ctl.app.config.instrument import InstrumentConfig, load_config
 from namod_ctl.app.dashboard.beside import dashboard_beside
+from namod_ctl.app.end_signals import ended_in_order
 from namod_ctl.app.views.align_view import AlignView, cycle_table
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.errors import ConfigError
@@ -145,7 +145,7 @@ def align(
         # written last, when the campaign is free for others: it takes some seconds
         stack.callback(write_campaign_report, store.path)
         stack.enter_context(store)
-        with _stopped_by_sigterm():
+        with ended_in_order(_interrupt):
             state = campaign.run()
         console.print(cycle_table(store.cycles()))
         if its_twin is not None:
@@ -261,15 +261,6 @@ def _wishes(
     return CampaignSettings(record, wishes["records"], wishes["cycles"], wishes["approve"] == Approve.ASK)
 
 
-@contextmanager
-def _stopped_by_sigterm() -> Iterator[None]:
-    """SIGTERM ends the program as Ctrl-C does: all motion stops first."""
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt("SIGTERM")
-
-    before: Callable[[int, FrameType | None], object] | int | None = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    """As Ctrl-C: all motion stops first."""
+    raise KeyboardInterrupt(signal.Signals(number).name)

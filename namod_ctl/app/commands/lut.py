@@ -328,11 +328,15 @@ def _aligned_at(table: GravityTable, aligned_at_deg: float | None) -> float:
 
 def _refuse_other_telescope(path: Path, table: GravityTable, config: InstrumentConfig) -> None:
     ids = {facet.id for facet in config.facets}
-    if config.telescope.name != table.telescope or not set(table.facet_ids) <= ids:
-        raise ConfigError(
-            f"{path}: is a table of {table.telescope}, with other facets than the config of {config.telescope.name}; "
-            "name the config of the telescope that was recorded with --config"
-        )
+    strange = sorted(ids ^ set(table.facet_ids))
+    if config.telescope.name != table.telescope:
+        problem = f"is a table of {table.telescope}, the config is of {config.telescope.name}"
+    elif strange:
+        listed = ", ".join(map(str, strange[:5])) + (", ..." if len(strange) > 5 else "")
+        problem = f"has other facets than the config of {config.telescope.name}: {listed}"
+    else:
+        return
+    raise ConfigError(f"{path}: {problem}; name the config of the telescope that was recorded with --config")
 
 
 def _check_output(out: Path, *, force: bool) -> None:

@@ -54,6 +54,13 @@ def rereduce(
         typer.Option("--accept", metavar="expired|foreign", help="Let such calibrations pass, on your own account."),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace an older run at --out.")] = False,
+    self_calibration: Annotated[
+        bool,
+        typer.Option(
+            "--self-calibration/--no-self-calibration",
+            help="Take out how responses depend on the star's brightness, before and after, as reconstruct does.",
+        ),
+    ] = True,
 ) -> None:
     """Reduce a run anew with newer calibrations of its cameras, and say what that changes.
 
@@ -99,11 +106,22 @@ def rereduce(
             new.set_note(NOTE_REREDUCED, f"{old.path.name} with {_named(new_config)}")
             new_records = new.records()
             with console.status("comparing"):
-                first = reconstruct(tabulate_responses(records, old.facet_ids), before)
-                second = reconstruct(tabulate_responses(new_records, new.facet_ids), after)
+                first, second = (
+                    reconstruct(tabulate_responses(of_run, ids), instrument, self_calibration=self_calibration)
+                    for of_run, ids, instrument in (
+                        (records, old.facet_ids, before),
+                        (new_records, new.facet_ids, after),
+                    )
+                )
             text = comparison_text(first.alignment, second.alignment, records, new_records)
             reconstruct_in(
-                new.path, DEFAULT_ESTIMATOR, deg_to_rad(DEFAULT_BIN_SIZE_DEG), SystemClock(), console, halves=False
+                new.path,
+                DEFAULT_ESTIMATOR,
+                deg_to_rad(DEFAULT_BIN_SIZE_DEG),
+                SystemClock(),
+                console,
+                halves=False,
+                self_calibration=self_calibration,
             )
             write_file_durably(new.path / COMPARISON_FILE, text.encode())
     console.print(f"{run.name}, with {_named(new_config)}")

@@ -49,6 +49,8 @@ def read_calibration(path: Path) -> Calibration:
         There is none, or it is not a calibration file of this program; with file, key, value and rule.
     """
     remedy = "name a file that 'namod-ctl calibrate' wrote"
+    if path.is_dir():
+        raise ConfigError(f"{path}: is a folder; {remedy}")
     if not path.is_file():
         raise ConfigError(f"{path}: there is no such calibration file; {remedy}")
     try:
@@ -61,8 +63,8 @@ def read_calibration(path: Path) -> Calibration:
         return _ADAPTER.validate_python(raw)
     except ValidationError as error:
         problems = [
-            f"{path}: {'.'.join(map(str, detail['loc'][1:] or detail['loc'])) or 'kind'}: {detail['msg']} "
-            f"(value: {str(detail['input'])[:60]})"
+            f"{path}: {'.'.join(map(str, detail['loc'][1:] or detail['loc'])) or 'kind'}: {detail['msg']}"
+            + ("" if detail["type"] == "missing" else f" (value: {str(detail['input'])[:60]})")
             for detail in error.errors()[:_MAX_PROBLEMS]
         ]
         raise ConfigError("\n".join(problems)) from None
@@ -111,14 +113,18 @@ def calibration_problems(camera: DeviceCameraSection, role: CameraRole, moment: 
             yield (
                 f"{what} is foreign: of {_identity(calibration.model, calibration.serial_number)}, but this camera is "
                 f"{_identity(camera.model, camera.serial_number)}; calibrate this camera, or let it pass with "
-                'accept_calibrations = ["foreign"]'
+                f'accept_calibrations = ["foreign"]{_beside(accepted)}'
             )
         valid_until = datetime.fromisoformat(calibration.valid_until_utc)
         if "expired" not in accepted and moment is not None and moment > valid_until:
             yield (
                 f"{what} has expired on {calibration.valid_until_utc}; calibrate anew, or let it pass with "
-                'accept_calibrations = ["expired"]'
+                f'accept_calibrations = ["expired"]{_beside(accepted)}'
             )
+
+
+def _beside(accepted: Sequence[str]) -> str:
+    return f" beside {', '.join(accepted)}" if accepted else ""
 
 
 def _is_foreign(calibration: Calibration, camera: DeviceCameraSection) -> bool:

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import math
-import signal
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
 
 import typer
 from rich.console import Console
 
 from namod_ctl.app.build.lut_motion import TableRig, open_table_rig
 from namod_ctl.app.config.instrument import InstrumentConfig
+from namod_ctl.app.end_signals import ended_in_order
 from namod_ctl.app.views.actuator_tables import table_of_orders
 from namod_ctl.app.views.number_ranges import counted
 from namod_ctl.calibration.gravity.gravity_table import GravityTable, Side
@@ -27,6 +24,7 @@ from namod_ctl.cycle.plan import Plan
 from namod_ctl.cycle.table_move import (
     Baseline,
     TablePlan,
+    halted_legs,
     moved_legs,
     note_zenith,
     noted_baseline,
@@ -39,6 +37,7 @@ from namod_ctl.store.campaign_rows import Cycle
 from namod_ctl.twin.settings import TwinSettings
 
 _MOST_SHOWN, _MOST_MOVED = 30, 5
+"""Signals that end the program in good order; the second comes when a terminal is closed or a line to it is lost."""
 _SAME_ZENITH_RAD = deg_to_rad(0.05)
 
 
@@ -69,7 +68,7 @@ def apply_table(
         Nobody knows where the facets were aligned, or legs were moved since; nothing has moved.
     """
     rig_of = open_table_rig(journal, config, SystemClock(), twin, is_new=aligned_at_rad is not None)
-    with rig_of as rig, _ended_by_sigterm():
+    with rig_of as rig, ended_in_order():
         if rig.twin is not None:
             console.print("The digital twin: a rehearsal, nothing real is moved.")
         if unfinished := rig.store.unfinished_orders():
@@ -144,7 +143,7 @@ def _plan(table: GravityTable, rig: TableRig, baseline: Baseline, to_rad: float,
         for facet_id, tilt in zip(table.facet_ids, tilts, strict=True)
         for index, travel_m in enumerate(rig.instrument.mounts[facet_id].travel_of_tilt(tilt))
     }
-    return plan_table_move(travels, baseline, rig.mover.read_states(), rig.drives, rig.settings)
+    return plan_table_move(travels, baseline, rig.mover.read_states(), rig.drives, rig.settings, halted_legs(rig.store))
 
 
 def _show(plan: TablePlan, table: GravityTable, aligned_at_rad: float, to_rad: float, console: Console) -> None:
@@ -178,17 +177,22 @@ def _carry_out(rig: TableRig, plan: TablePlan, to_rad: float, console: Console) 
         with console.status(f"{counted(len(plan.orders), 'leg')} on the way; Ctrl-C stops all drives"):
             summary = rig.corrector.carry_out(cycle, approved, rig.poll)
     except StopAsked as stop:
-        rig.store.add_event("lut_stopped", str(stop), {"cycle": cycle})
-        console.print(
-            f"Stopped: {stop}. Legs stand where they were halted, which is on record; apply it again to go on."
-        )
+        _tell_stopped(rig, cycle, str(stop), console)
         return False
+    except (KeyboardInterrupt, SystemExit) as end:  # the drives were stopped on the way here
+        _tell_stopped(rig, cycle, "Ctrl-C" if isinstance(end, KeyboardInterrupt) else "the program was ended", console)
+        raise
     rig.store.add_event("lut_applied", summary, {"cycle": cycle})
     is_complete = summary == f"{len(plan.orders)} of {len(plan.orders)} legs arrived"
     if is_complete:
         note_zenith(rig.store, to_rad)
     console.print(f"{summary}. On record in {rig.store.path}", markup=False)
     return is_complete
+
+
+def _tell_stopped(rig: TableRig, cycle: int, why: str, console: Console) -> None:
+    rig.store.add_event("lut_stopped", why, {"cycle": cycle})
+    console.print(f"Stopped: {why}. Legs stand where they were halted, which is on record; apply it again to go on.")
 
 
 def _tell_truth(rig: TableRig, to_rad: float, console: Console) -> None:
@@ -202,18 +206,6 @@ def _tell_truth(rig: TableRig, to_rad: float, console: Console) -> None:
         f"The twin's truth: at {rad_to_deg(to_rad):g} deg A_sigma is {ratio:.3f} times that of the same facets "
         "perfectly aligned."
     )
-
-
-@contextmanager
-def _ended_by_sigterm() -> Iterator[None]:
-    def leave(number: int, frame: FrameType | None) -> None:
-        raise SystemExit(128 + number)
-
-    before = signal.signal(signal.SIGTERM, leave)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _ask(question: str, *, is_yes: bool) -> None:

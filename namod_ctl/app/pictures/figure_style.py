@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import math
+from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
@@ -15,11 +16,13 @@ from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from namod_ctl.core.errors import ConfigError
 from namod_ctl.core.units import rad_to_deg
 
 DPI = 120
 ORANGE, SKY, VERMILLION = "#e69f00", "#56b4e9", "#d55e00"
 NOT_SEEN = "#e4e4e4"
+PNG_SUFFIX = ".png"
 
 
 def colours() -> Colormap:
@@ -34,6 +37,14 @@ def ellipse_axes(cov: NDArray[np.float64]) -> tuple[float, float, float]:
     variances, directions = np.linalg.eigh(cov)
     minor, major = 2.0 * np.sqrt(np.maximum(variances, 0.0))
     return float(major), float(minor), rad_to_deg(math.atan2(directions[1, 1], directions[0, 1]))
+
+
+def picture_beside(path: Path) -> Path:
+    """The picture that belongs to the file `path`. Raises ConfigError where it would take that file's own place."""
+    picture = path.with_suffix(PNG_SUFFIX)
+    if picture == path:
+        raise ConfigError(f"{path}: this is the name of the picture that is written beside it; end it with .json")
+    return picture
 
 
 def figure_to_png(figure: Figure) -> bytes:

@@ -32,6 +32,7 @@ from namod_ctl.core.units import rad2_to_arcmin2, rad_to_arcmin
 from namod_ctl.optics.instrument import Instrument
 from namod_ctl.reconstruction.alignment import Alignment
 from namod_ctl.reconstruction.estimators import DEFAULT_ESTIMATOR
+from namod_ctl.reconstruction.normalization import is_self_calibrated
 from namod_ctl.reconstruction.reconstruct import Reconstruction, reconstruct
 from namod_ctl.reconstruction.responses import tabulate_responses
 from namod_ctl.store.combine import NOTE_COMBINED
@@ -50,14 +51,18 @@ def run_report(path: Path) -> tuple[Document, Mapping[str, bytes]]:
         origin = origin_of(run, config)
         stored = read_alignment(path) if (path / ALIGNMENT_FILE).is_file() else None
         estimator = DEFAULT_ESTIMATOR if stored is None else stored.estimator
+        is_calibrated = stored is None or is_self_calibrated(stored.remarks)
+        was_off = False
         chapters = [_done(run, records, origin)]
         bad: list[Block] = []
         try:
-            result = reconstruct(tabulate_responses(records, run.facet_ids), instrument, estimator)
+            table = tabulate_responses(records, run.facet_ids)
+            result = reconstruct(table, instrument, estimator, self_calibration=is_calibrated)
         except DataQualityError as error:
             chapters.insert(0, Chapter("Result", (Text(f"There is none: {error}", is_warning=True),)))
         else:
             alignment = stored or result.alignment
+            was_off = not is_calibrated and result.normalization.is_worth_removing
             bad = bad_record_blocks(alignment.bad_records)
             chapters.insert(0, _result(alignment, result, instrument))
             chapters += [
@@ -66,10 +71,12 @@ def run_report(path: Path) -> tuple[Document, Mapping[str, bytes]]:
             ]
             if remarks := remark_blocks(alignment):
                 chapters.append(Chapter("Remarks of the reconstruction", tuple(remarks)))
+        choice = "" if estimator == DEFAULT_ESTIMATOR else f" --estimator {estimator}"
+        choice += " --no-self-calibration" if was_off else ""
         chapters += [
             Chapter("Records that do not count", (rejection_table([("number", records)]), *bad)),
             config_chapter(config, instrument),
-            reproduce_chapter(origin, _commands(path, run, records, origin, estimator), __version__, run.config_json),
+            reproduce_chapter(origin, _commands(path, run, records, origin, choice), __version__, run.config_json),
         ]
         title = f"{run.telescope}: run {path.resolve().name}"
         subtitle = f"Recorded {when_text(run.created_utc)}; {run.source}. Reported by namod-ctl {__version__}."
@@ -123,9 +130,8 @@ def _done(run: RunStore, records: list[Record], origin: Origin) -> Chapter:
     return Chapter("What was done", tuple(blocks))
 
 
-def _commands(path: Path, run: RunStore, records: list[Record], origin: Origin, estimator: str) -> tuple[str, ...]:
+def _commands(path: Path, run: RunStore, records: list[Record], origin: Origin, choice: str) -> tuple[str, ...]:
     name = quoted(path.resolve().name)
-    choice = "" if estimator == DEFAULT_ESTIMATOR else f" --estimator {estimator}"
     commands = [
         f"namod-ctl reconstruct {name}{choice}      # from the records in run.sqlite",
         f"namod-ctl report {name}",

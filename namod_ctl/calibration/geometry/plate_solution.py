@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.stats import f as f_distribution
 
 from namod_ctl.optics.camera_model import CameraModel, Distortion
+from namod_ctl.optics.coordinates import angles_of_direction, direction_at_angles
 
 Array = NDArray[np.float64]
 
@@ -92,34 +93,18 @@ class Plate:
 
     def directions_of(self, pixel: Array) -> Array:
         """Unit vectors (..., 3) in the frame of the sky, of positions (..., 2)."""
-        directions: Array = unit_vectors(self.angles_of(pixel)) @ self.attitude.T
+        directions: Array = direction_at_angles(self.angles_of(pixel)) @ self.attitude.T
         return directions
 
     def pixels_of(self, directions: Array) -> Array:
         """Positions (..., 2) of unit vectors (..., 3) of the sky; without meaning far outside of the image."""
-        straight = angles_of_directions(directions, self.attitude) / self.plate_scale_rad * self.signs
+        straight = angles_of_direction(directions @ self.attitude) / self.plate_scale_rad * self.signs
         return self.distortion.distorted(straight + self.centre_pixel, self.plate_scale_rad)
 
     @property
     def signs(self) -> Array:
         """Of columns and rows along the camera's first two axes, shape (2,)."""
         return np.array([-1.0 if self.is_mirrored else 1.0, -1.0])
-
-
-def unit_vectors(angles_rad: Array) -> Array:
-    """Unit vectors (..., 3) at these angles (..., 2) from the third axis, on their side of it."""
-    angle = np.linalg.norm(angles_rad, axis=-1, keepdims=True)
-    return np.concatenate([np.sinc(angle / math.pi) * angles_rad, np.cos(angle)], axis=-1)
-
-
-def angles_of_directions(directions: Array, attitude: Array) -> Array:
-    """Angles (..., 2) from the third axis of `attitude` along its first two, rad, of unit vectors (..., 3)."""
-    seen = directions @ attitude
-    sideways = np.hypot(seen[..., 0], seen[..., 1])
-    angle = np.arctan2(sideways, seen[..., 2])
-    stretch = np.divide(angle, sideways, out=np.ones_like(angle), where=sideways > 0.0)
-    angles: Array = seen[..., :2] * stretch[..., None]
-    return angles
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -246,10 +231,10 @@ def _linearized(plate: Plate, pixel: Array, directions: Array) -> tuple[Array, A
     a2 = scale**2 * np.sum(offset**2, axis=1, keepdims=True)
     k1, k2 = plate.k1_per_rad2, plate.k2_per_rad4
     stretch = 1.0 + k1 * a2 + k2 * a2**2
-    sky = angles_of_directions(directions, plate.attitude) / scale
+    sky = angles_of_direction(directions @ plate.attitude) / scale
     slope = np.empty((*pixel.shape, CENTRE_Y + 1))
     for axis, turn in enumerate(_SMALL_TURN_RAD * np.eye(_N_ATTITUDE)):
-        turned_sky = angles_of_directions(directions, plate.attitude @ turned(turn)) / scale
+        turned_sky = angles_of_direction(directions @ plate.attitude @ turned(turn)) / scale
         slope[:, :, axis] = (sky - turned_sky) / _SMALL_TURN_RAD
     slope[:, :, SCALE] = signs * offset * (2.0 * k1 * a2 + 4.0 * k2 * a2**2) + sky
     slope[:, :, K1], slope[:, :, K2] = signs * offset * a2, signs * offset * a2**2
@@ -283,7 +268,7 @@ def turned(turn_rad: Array) -> Array:
 
 def _residual_px(plate: Plate, pixel: Array, directions: Array) -> Array:
     """Image less model, (n, 2), in units of a pixel at the centre."""
-    difference = plate.angles_of(pixel) - angles_of_directions(directions, plate.attitude)
+    difference = plate.angles_of(pixel) - angles_of_direction(directions @ plate.attitude)
     residual: Array = difference / plate.plate_scale_rad
     return residual
 
@@ -296,8 +281,8 @@ def rotation_at(plate: Plate, axis_pixel: Array) -> float:
     at = plate.angles_of(axis_pixel)
     step = 1e-6
     offsets = np.array([[step, 0.0], [-step, 0.0], [0.0, step], [0.0, -step]])
-    ahead, behind, over, under = unit_vectors(at + offsets) @ plate.attitude.T
-    out = unit_vectors(at) @ plate.attitude.T
+    ahead, behind, over, under = direction_at_angles(at + offsets) @ plate.attitude.T
+    out = direction_at_angles(at) @ plate.attitude.T
     left = np.cross([0.0, 0.0, 1.0], out)
     left /= np.linalg.norm(left)
     up = np.cross(out, left)

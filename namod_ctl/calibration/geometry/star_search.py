@@ -25,7 +25,6 @@ from namod_ctl.calibration.geometry.plate_solution import (
     Plate,
     PlateFit,
     fit_plate,
-    unit_vectors,
 )
 from namod_ctl.calibration.geometry.star_triangles import (
     SCALE_TOLERANCE,
@@ -39,6 +38,7 @@ from namod_ctl.calibration.geometry.star_triangles import (
     triangles_of,
 )
 from namod_ctl.optics.camera_model import CameraModel
+from namod_ctl.optics.coordinates import direction_at_angles
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -175,7 +175,7 @@ class FieldSearch:
     def _suggestions(self) -> list[tuple[int, Plate]]:
         """How many stars it explains, and the plate, of triangles that look alike; most stars first."""
         angles = self._rough.angles_of(self._seen.pixel[: self._n_bright])
-        vectors = unit_vectors(angles)
+        vectors = direction_at_angles(angles)
         shortest_rad = SHORTEST_SIDE_SHARE * self._diagonal_rad
         of_frame = triangles_of(vectors, all_corners(min(self._n_bright, N_TRIANGLE_STARS)), shortest_rad)
         of_sky = self._triangles_of_sky(shortest_rad * (1.0 - SCALE_TOLERANCE))
@@ -220,7 +220,7 @@ class FieldSearch:
         assert self._tree is not None
         signs = np.stack([np.where(is_mirrored, -1.0, 1.0), np.ones(scale.size)], axis=-1)
         all_angles = angles * (scale[:, None] * signs)[:, None, :]
-        vectors = unit_vectors(all_angles)
+        vectors = direction_at_angles(all_angles)
         rows = np.arange(scale.size)[:, None]
         turns = attitudes(vectors[rows, corners], self._known.directions[known])
         directions = vectors @ turns.transpose(0, 2, 1)
@@ -319,7 +319,7 @@ class FieldSearch:
         longest_rad = self._diagonal_rad * (1.0 + SCALE_TOLERANCE)
         pairs = cKDTree(known.directions).query_pairs(longest_rad, output_type="ndarray")
         of_sky = np.sort(np.linalg.norm(known.directions[pairs[:, 0]] - known.directions[pairs[:, 1]], axis=1))
-        vectors = unit_vectors(self._rough.angles_of(self._seen.pixel[:n]))
+        vectors = direction_at_angles(self._rough.angles_of(self._seen.pixel[:n]))
         i, j = np.triu_indices(n, 1)
         length = np.linalg.norm(vectors[i] - vectors[j], axis=1)
         within = np.searchsorted(of_sky, length * (1.0 + SCALE_TOLERANCE)) - np.searchsorted(

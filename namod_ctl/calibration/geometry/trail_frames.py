@@ -68,11 +68,15 @@ def trail_spots(frame: Frame, camera: CameraModel, star_size_rad: float, exposur
     ------
     ConfigError
         The frame is not one of this camera.
+    DataQualityError
+        It is saturated all over.
     """
     full_scale_adu, saturated_adu = camera.full_scale_adu, saturation_adu(camera)
     grey = grey_frame(without_dark(frame, camera, exposure_s), saturated_adu)
     size_px = star_size_rad / camera.plate_scale_rad
     look = first_look(grey, size_px, full_scale_adu, fainter_share=FAINTER_SHARE)
+    if look.sky_adu >= saturated_adu:
+        raise DataQualityError(f"the sky itself is saturated ({look.sky_adu:.0f} of {full_scale_adu:.0f})")
     table = response_table(camera, grey.dtype)
     found: list[TrailSpot] = []
     for spot in look.spots[: 2 * MAX_SPOTS]:

@@ -14,7 +14,7 @@ from namod_ctl.calibration.geometry.serial_noise import variance_factor
 from namod_ctl.calibration.sky.star_path import EARTH_RATE_RAD_PER_S, StarPath
 from namod_ctl.core.errors import DataQualityError
 from namod_ctl.optics.camera_model import CameraModel, Distortion
-from namod_ctl.optics.coordinates import CameraOrientation, direction_to_star
+from namod_ctl.optics.coordinates import CameraOrientation, direction_to_star, theta_of_direction
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -83,11 +83,6 @@ def _camera_of(camera: CameraModel, parameters: Array) -> CameraModel:
     )
 
 
-def _theta_of(direction: Array) -> Array:
-    theta: Array = np.arctan2(direction[:, :2], direction[:, 2:])
-    return theta
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fitting:
     """A trail, a path and a first guess, which parameters are relative to."""
@@ -103,7 +98,7 @@ class _Fitting:
         direction = path.direction
         if len(parameters) > DECLINATION:
             direction = path.moved_towards_pole(float(parameters[DECLINATION]))
-        return _theta_of((Rotation.from_rotvec(parameters[TURN]) * self.start).apply(direction))
+        return theta_of_direction((Rotation.from_rotvec(parameters[TURN]) * self.start).apply(direction))
 
     def axes(self, parameters: Array) -> Array:
         """Unit vectors along the motion and across it, shape (n, 2, 2): [frame, which, telescope axis]."""

@@ -192,9 +192,9 @@ def _refuse_bright(groups: Sequence[Sequence[DarkFrame]], full_scale_adu: float)
 
 
 def _trimmed_mean(image: Image) -> float:
-    """Mean without the brightest tenth of a percent, where hot pixels and cosmic rays are."""
+    """Mean without the brightest hundredth, where hot pixels and cosmic rays are."""
     counts = np.bincount(image.ravel())
-    last = int(np.searchsorted(np.cumsum(counts), 0.999 * image.size))
+    last = int(np.searchsorted(np.cumsum(counts), (1.0 - MAX_HOT_SHARE) * image.size))
     counts = counts[: last + 1]
     return float(np.average(np.arange(len(counts)), weights=counts))
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from namod_ctl.calibration.lamp.lamp_series import Placement
 from namod_ctl.calibration.lamp.lamp_visits import Visits
 from namod_ctl.calibration.lamp.radiometric_fit import LampData, LawFit, LawForm, fit_law
 from namod_ctl.core.errors import DataQualityError
@@ -27,29 +25,10 @@ MIN_KEPT_SHARE = 0.5
 SIGNIFICANT = 4.0
 """Standard errors from which on a further term is taken for real: one in 16 000 by chance."""
 
-SCALE_ODDS = (1.0, 2.0)
-"""Before the data are seen, errors of distances are more likely alike in metres than in share of the light."""
-
 MIN_BIC_GAIN = 10.0
 MIN_PLACEMENTS_FOR_OFFSET = 6
 MAX_DRIFT_ERROR_DEX = 0.02
 """With repetitions that tell less of the lamp's drift than this, it is not fitted."""
-
-
-def placement_scales(data: LampData, placements: Sequence[Placement]) -> list[Array]:
-    """How large errors of placements may be against one another, shape (n_visits,) each: all alike, or, of distances,
-    all alike in metres, which are smaller in intensity the further off the lamp is."""
-    distance_m = np.array([placements[number].distance_m or math.nan for number in data.placement])
-    alike = np.ones_like(distance_m)
-    return [alike, 1.0 / distance_m] if np.isfinite(distance_m).all() else [alike]
-
-
-def with_likeliest_scale(data: LampData, scales: Sequence[Array], form: LawForm, is_kept: Mask) -> LampData:
-    """The data with that of the scales under which they are likeliest."""
-    if len(scales) == 1:
-        return data
-    tried = [replace(data, placement_scale=scale / scale[is_kept].mean()) for scale in scales]
-    return max(tried, key=lambda one: fit_law(one.only(is_kept), form).restricted_log_likelihood)
 
 
 def drift_form(data: LampData, visits: Visits, is_kept: Mask) -> LawForm:
@@ -115,11 +94,15 @@ def chosen_form(data: LampData, straight: LawFit, is_kept: Mask) -> tuple[LawFor
 
 
 def offset_form(data: LampData, form: LawForm) -> LawForm:
-    """With an offset of all distances, as if they were not measured from the lamp's filament, where one is sure."""
+    """With an offset of all distances, as if they were not measured from the lamp's filament, where one is sure.
+
+    Smaller ones than the person allows for are in the covariance.
+    """
     if not data.dex_per_m.any() or len(np.unique(data.placement)) < MIN_PLACEMENTS_FOR_OFFSET:
         return form
     plain, wider = fit_law(data, form), fit_law(data, replace(form, has_offset=True))
-    is_sure = abs(wider.offset_m) > SIGNIFICANT * wider.offset_error_m and wider.bic < plain.bic - MIN_BIC_GAIN
+    expected_m = math.hypot(wider.offset_error_m, data.distance_error_m)
+    is_sure = abs(wider.offset_m) > SIGNIFICANT * expected_m and wider.bic < plain.bic - MIN_BIC_GAIN
     return wider.form if is_sure else form
 
 

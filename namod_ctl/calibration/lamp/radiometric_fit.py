@@ -6,13 +6,15 @@ of the true light: regressing the intensity on the measured response would bend 
 therefore formed with the response that the law predicts for the nominal light (the method of instrumental variables),
 which makes them those of a regression of the response on what is known, for straight and for curved laws.
 
-Variances of placements and visits are found by restricted maximum likelihood, from the data themselves.
+Variances of placements and visits are found by restricted maximum likelihood, from the data themselves. Distances err
+alike in metres, levels alike in their share of the light; what was set by distances errs in its share as well where the
+data show it. How well distances are known the person says: each alone errs by no more, which the data tell, and all of
+them together by as much, which hardly shows in a series.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -31,9 +33,13 @@ UNSEEN_SHARE = 0.25
 
 RELATIVE_STEP = 0.01
 LEAST_FREEDOM = 4.0
+LEAST_VARIANCE = 1e-18
 N_ITERATIONS = 5
 LOG_DEX_RANGE = (-5.0, 0.0)
 GRID_LOG_DEX = (-4.5, -3.7, -3.0, -2.4, -1.8, -1.2)
+BOTH_GAIN = 1.0
+"""By so much must log likelihood grow for a variance of shares beside that of metres (Akaike's criterion)."""
+
 UNTUNED = 1e-4
 """Change of a term after which the deviations are sought anew."""
 
@@ -58,10 +64,10 @@ class LampData:
         Change of `log_share` per adu of error of the dark level, which is known within `dark_uncertainty_adu`.
     time
         From -0.5 to 0.5.
-    placement_scale
-        How large errors of a visit's placement are against those of others; one number for each placement.
     dex_per_m
-        Change of log10 of the light with the distance; 0 where levels were given as such.
+        Change of log10 of the light with the distance, one number for each placement; 0 where levels were given.
+    distance_error_m
+        Standard deviation of an error that all distances have in common, and the largest one of their own errors.
     """
 
     log_share: Array
@@ -72,8 +78,8 @@ class LampData:
     lever_per_adu: Array
     dark_uncertainty_adu: float
     time: Array
-    placement_scale: Array
     dex_per_m: Array
+    distance_error_m: float = 0.0
 
     def only(self, is_kept: NDArray[np.bool_]) -> LampData:
         """The data of some visits; placements without any are closed up."""
@@ -87,8 +93,8 @@ class LampData:
             self.lever_per_adu[is_kept],
             self.dark_uncertainty_adu,
             self.time[is_kept],
-            self.placement_scale[is_kept],
             self.dex_per_m[is_kept],
+            self.distance_error_m,
         )
 
 
@@ -117,13 +123,14 @@ class LawFit:
     offset_m, offset_error_m
         What all distances are to be increased by, and its standard error; 0 where it is not fitted.
     visit_dex, placement_dex
-        Standard deviations of log10 of the intensity of a visit and of a placement, beyond what the frames show.
+        Standard deviations of log10 of the intensity of a visit and of a placement (root mean square of all of them),
+        beyond what the frames show.
     placement_error_dex
         Shape (n_placements,): how far each placement's light is from what its level says.
     residual_dex
         Shape (n,): log10 of the intensity by the law less the nominal one, drift and placement errors taken off.
-    log_likelihood, restricted_log_likelihood
-        Of the data: for comparison of forms, and of scales of placements.
+    log_likelihood
+        Of the data: for comparison of forms.
     """
 
     form: LawForm
@@ -139,7 +146,6 @@ class LawFit:
     residual_dex: Array
     standardized: Array
     log_likelihood: float
-    restricted_log_likelihood: float
     n_terms: int
 
     @property
@@ -178,24 +184,6 @@ def fit_law(data: LampData, form: LawForm) -> LawFit:
     return problem.judged(deviations)
 
 
-def fit_law_of_any_scale(data: LampData, form: LawForm, scales: Sequence[Array], odds: Sequence[float]) -> LawFit:
-    """The law where nobody knows how errors of placements compare with one another.
-
-    The average of the fits for each of `scales` (shape (n_visits,) each), weighted by their restricted likelihoods and
-    by the `odds` they had before; the covariance holds how they differ too. All else is that of the likeliest fit.
-    """
-    fits = [fit_law(replace(data, placement_scale=scale / float(np.sqrt(np.mean(scale**2)))), form) for scale in scales]
-    log_likelihood = np.array([fit.restricted_log_likelihood for fit in fits])
-    weight = np.exp(log_likelihood - log_likelihood.max()) * np.array(odds)
-    weight /= weight.sum()
-    parameters = np.array([fit.parameters for fit in fits])
-    mean = weight @ parameters
-    away = parameters - mean
-    covariance = np.einsum("k,kij->ij", weight, np.array([fit.covariance for fit in fits]))
-    covariance += np.einsum("k,ki,kj->ij", weight, away, away)
-    return replace(fits[int(np.argmax(weight))], parameters=mean, covariance=covariance)
-
-
 def _start(data: LampData, form: LawForm) -> Array:
     """A straight law by plain least squares of the response on what is known."""
     design = np.stack([data.log_level, data.log_exposure, np.ones_like(data.log_level)], axis=1)
@@ -217,9 +205,18 @@ class _Problem:
         self.fixed = [data.log_exposure, np.ones_like(data.log_share)]
         self.lamp = drift + ([-data.dex_per_m] if form.has_offset else [])
         self.terms = self._design(data.log_share)
-        belongs = (data.placement[:, None] == np.arange(self.n_placements)).astype(np.float64)
-        self.membership = belongs * data.placement_scale[:, None]
-        self.placement_scale = self.membership.max(axis=0)
+        self.membership = (data.placement[:, None] == np.arange(self.n_placements)).astype(np.float64)
+        per_m = np.array([np.abs(data.dex_per_m[data.placement == i]).max() for i in range(self.n_placements)])
+        root_mean_square = float(np.sqrt(np.mean(per_m**2)))
+        # Shape (2, n_placements): a placement's variance by that of shares, and by that of metres.
+        alike_in_metres = (per_m / root_mean_square) ** 2 if root_mean_square else np.zeros_like(per_m)
+        self.shares = np.stack([np.ones_like(per_m), alike_in_metres])
+        largest_dex = data.distance_error_m * root_mean_square
+        self.is_set_by_distance = largest_dex > 10.0 ** LOG_DEX_RANGE[0]
+        largest_log_dex = min(float(np.log10(largest_dex)), LOG_DEX_RANGE[1]) if self.is_set_by_distance else 0.0
+        self.bounds = np.array([LOG_DEX_RANGE, LOG_DEX_RANGE, (LOG_DEX_RANGE[0], largest_log_dex)])
+        self.is_free = np.array([True, False, False])
+        self.offset_error_m = 0.0 if form.has_offset else data.distance_error_m
 
     def _design(self, log_share: Array) -> Array:
         curve = [log_share**2] if self.form.is_curved else []
@@ -237,15 +234,19 @@ class _Problem:
         self.instruments = self._design(predicted)
         self.slope = np.maximum(theta[0] + 2.0 * curve * predicted, 0.05)
         self.lever = (self.slope * self.data.lever_per_adu)[:, None]
-        self.common = np.hstack([self.membership, self.lever])
+        self.common = np.hstack([self.membership, self.lever, self.data.dex_per_m[:, None]])
+
+    def _common_variance(self, deviations: Array) -> Array:
+        """Of the errors that visits have in common: of each placement, of the dark level, of all distances."""
+        known = np.array([self.data.dark_uncertainty_adu, self.offset_error_m]) ** 2
+        variance: Array = np.maximum(np.append(deviations[1:] ** 2 @ self.shares, known), LEAST_VARIANCE)
+        return variance
 
     def _inverse(self, deviations: Array) -> tuple[Array, Array, float]:
         """1 / D, the inverse of the small matrix of Woodbury's formula, and log det of the covariance V = D + U S
         U'."""
-        visit, placement = float(deviations[0]), float(deviations[1])
-        weight = 1.0 / (self.slope**2 * self.data.variance + visit**2)
-        variance = np.append(np.full(self.n_placements, max(placement, 1e-9) ** 2), 0.0)
-        variance[-1] = max(self.data.dark_uncertainty_adu, 1e-9) ** 2
+        weight = 1.0 / (self.slope**2 * self.data.variance + float(deviations[0]) ** 2)
+        variance = self._common_variance(deviations)
         small = np.diag(1.0 / variance) + self.common.T @ (weight[:, None] * self.common)
         _, log_det_small = np.linalg.slogdet(small)
         log_det = log_det_small + float(np.log(variance).sum()) - float(np.log(weight).sum())
@@ -277,21 +278,48 @@ class _Problem:
         return 0.5 * (log_det + determinant + chi2)
 
     def likeliest_deviations(self) -> Array:
-        """Deviations of visits and placements, in dex, by restricted maximum likelihood."""
-        n_free = 2 if self.is_placement_known else 1
-        given = np.array([ASSUMED_PLACEMENT_DEX])[: 2 - n_free]
-
-        def target(logs: Array) -> float:
-            return self._minus_log_likelihood(np.append(10.0**logs, given), is_restricted=True)
-
-        # From a wrong start the first step of a search is so long that it never comes back: so a grid comes first.
-        starts = [np.array(start) for start in product(GRID_LOG_DEX, repeat=n_free)]
-        found = minimize(target, min(starts, key=target), method="L-BFGS-B", bounds=[LOG_DEX_RANGE] * n_free)
-        deviations = np.append(10.0**found.x, given)
+        """Deviations of visits, and of placements in share and in metres, in dex; `is_free` says which are sought."""
+        if not self.is_placement_known:
+            return self._likeliest((True, False, False), np.array([0.0, ASSUMED_PLACEMENT_DEX, 0.0]))[0]
+        alone = (True, not self.is_set_by_distance, self.is_set_by_distance)
+        deviations, least = self._likeliest(alone, np.zeros(3))
+        if self.is_set_by_distance:
+            both, further = self._likeliest((True, True, True), deviations)
+            if further < least - BOTH_GAIN:
+                deviations = both
+            else:
+                self.is_free = np.array(alone)
         weight, _, _ = self._inverse(deviations)
         seen_dex = (self.n_placements / float(weight.sum())) ** 0.5
-        deviations[1] = max(deviations[1], UNSEEN_SHARE * seen_dex)
+        missing = (UNSEEN_SHARE * seen_dex) ** 2 - self._placement_variance(deviations)
+        last = int(np.flatnonzero(self.is_free)[-1])
+        deviations[last] = (deviations[last] ** 2 + max(missing, 0.0)) ** 0.5
         return deviations
+
+    def _likeliest(self, is_free: tuple[bool, bool, bool], start: Array) -> tuple[Array, float]:
+        """Deviations, by restricted maximum likelihood, and minus the logarithm of that."""
+        self.is_free = np.array(is_free)
+
+        def completed(logs: Array) -> Array:
+            deviations = start.copy()
+            deviations[self.is_free] = 10.0**logs
+            return deviations
+
+        def target(logs: Array) -> float:
+            return self._minus_log_likelihood(completed(logs), is_restricted=True)
+
+        # From a wrong start the first step of a search is so long that it never comes back: so a grid comes first.
+        grids = [
+            GRID_LOG_DEX if free and not old else (float(np.log10(old or 1.0)),)
+            for free, old in zip(is_free, start, strict=True)
+        ]
+        bounds = self.bounds[self.is_free]
+        starts = [np.clip(np.array(one)[self.is_free], *bounds.T) for one in product(*grids)]
+        found = minimize(target, min(starts, key=target), method="L-BFGS-B", bounds=bounds)
+        return completed(found.x), float(found.fun)
+
+    def _placement_variance(self, deviations: Array) -> float:
+        return float(np.mean(deviations[1:] ** 2 @ self.shares))
 
     def judged(self, deviations: Array) -> LawFit:
         """The fit with everything that is said of it."""
@@ -306,9 +334,8 @@ class _Problem:
         weight, small, _ = self._inverse(deviations)
         whole = self.terms @ theta - self.data.log_level
         best = self._apply(weight, small, whole[:, None])[:, 0]
-        effect = deviations[1] ** 2 * (self.membership.T @ best)
-        dark_error = self.data.dark_uncertainty_adu**2 * float(self.lever[:, 0] @ best)
-        residual = whole - self.membership @ effect - self.lever[:, 0] * dark_error
+        effect = self._common_variance(deviations) * (self.common.T @ best)
+        residual = whole - self.common @ effect
         return LawFit(
             form=self.form,
             parameters=parameters,
@@ -318,12 +345,11 @@ class _Problem:
             offset_m=float(theta[-1]) if self.form.has_offset else 0.0,
             offset_error_m=float(cov[-1, -1] ** 0.5) if self.form.has_offset else 0.0,
             visit_dex=float(deviations[0]),
-            placement_dex=float(deviations[1]),
-            placement_error_dex=-effect * self.placement_scale,
+            placement_dex=self._placement_variance(deviations) ** 0.5,
+            placement_error_dex=-effect[: self.n_placements],
             residual_dex=residual,
             standardized=residual * np.sqrt(weight),
             log_likelihood=-self._minus_log_likelihood(deviations, is_restricted=False),
-            restricted_log_likelihood=-self._minus_log_likelihood(deviations, is_restricted=True),
             n_terms=len(theta),
         )
 
@@ -333,25 +359,24 @@ class _Problem:
         Student's quantile for the degrees of freedom that Satterthwaite's formula gives from the information that the
         data hold on the two variances (Giesbrecht and Burns 1985, Biometrics 41, 477).
         """
-        variances = deviations**2
-        n_free = 2 if self.is_placement_known else 1
-        gradient = np.zeros((n_free, len(cov)))
-        for i in range(n_free):
-            step = np.zeros(2)
-            step[i] = RELATIVE_STEP * variances[i]
+        variances = np.maximum(deviations**2, LEAST_VARIANCE)
+        free = np.flatnonzero(self.is_free)
+        gradient = np.zeros((len(free), len(cov)))
+        for i, number in enumerate(free):
+            step = np.zeros(len(variances))
+            step[number] = RELATIVE_STEP * variances[number]
             _, beyond = self.solve(np.sqrt(variances + step))
             _, before = self.solve(np.sqrt(variances - step))
-            gradient[i] = np.diag(beyond - before) / (2.0 * step[i])
+            gradient[i] = np.diag(beyond - before) / (2.0 * step[number])
         weight, small, _ = self._inverse(deviations)
         inverse = self._apply(weight, small, np.eye(len(self.data.log_share)))
         applied = inverse @ self.instruments
         projected = inverse - applied @ np.linalg.solve(self.instruments.T @ applied, applied.T)
-        of_placements = projected @ self.membership
-        information = np.empty((2, 2))
-        information[0, 0] = np.sum(projected**2)
-        information[0, 1] = information[1, 0] = np.sum(of_placements**2)
-        information[1, 1] = np.sum((self.membership.T @ of_placements) ** 2)
-        scatter = np.linalg.inv(0.5 * information[:n_free, :n_free])
+        # Derivatives of the covariance by the variances, as factors A of A A'.
+        factors = [np.eye(len(projected)), *(self.membership * np.sqrt(share) for share in self.shares)]
+        factors = [factors[number] for number in free]
+        information = np.array([[np.sum((one.T @ projected @ other) ** 2) for other in factors] for one in factors])
+        scatter = np.linalg.pinv(0.5 * information)
         spread = np.einsum("in,ij,jn->n", gradient, scatter, gradient)
         freedom = np.maximum(2.0 * np.diag(cov) ** 2 / np.maximum(spread, 1e-300), LEAST_FREEDOM)
         factor: Array = stdtrit(freedom, TWO_SIGMA) / 2.0

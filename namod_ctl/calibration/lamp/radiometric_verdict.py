@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -23,16 +23,13 @@ from namod_ctl.calibration.lamp.radiometric_checks import (
     plateau_share,
 )
 from namod_ctl.calibration.lamp.radiometric_choice import (
-    SCALE_ODDS,
     chosen_form,
     drift_form,
     offset_form,
-    placement_scales,
     trimmed,
-    with_likeliest_scale,
     without_odd,
 )
-from namod_ctl.calibration.lamp.radiometric_fit import LampData, LawFit, fit_law, fit_law_of_any_scale
+from namod_ctl.calibration.lamp.radiometric_fit import LampData, LawFit, fit_law
 from namod_ctl.core.errors import DataQualityError
 from namod_ctl.core.units import m_to_mm
 from namod_ctl.imaging.dark import QUANTISATION_NOISE_ADU
@@ -48,7 +45,9 @@ SATURATION_MARGIN = 0.98
 
 BIN_DEX = 0.15
 
-TAPE_ERROR_M = 0.005
+DISTANCE_ERROR_M = 0.005
+"""The error common to all distances where nobody says another: a filament's place in its bulb, a tape's loose end."""
+
 GOOD_SHARE = 0.01
 """A calibration is good when intensities by its law are as sure as that."""
 
@@ -107,6 +106,7 @@ def calibrate_radiometric(
     dark: PatchDark,
     n_pixels: int,
     full_scale_adu: float,
+    distance_error_m: float = DISTANCE_ERROR_M,
 ) -> RadiometricFinding:
     """The law of the camera from responses to a lamp at known relative intensities.
 
@@ -116,6 +116,8 @@ def calibrate_radiometric(
         By the numbers that responses name.
     n_pixels
         Of the patch.
+    distance_error_m
+        Standard deviation of the error that all distances have in common, as from another end of the tape.
 
     Raises
     ------
@@ -129,14 +131,12 @@ def calibrate_radiometric(
         plateau, is_seen = plateau_share(visits)
         is_open = visits.is_usable & (visits.largest_share < 0.97 * plateau)
         check_levels(visits, is_open)
-        data = _data(visits, placements, dark)
+        data = _data(visits, placements, dark, distance_error_m)
         is_sure = is_open & (visits.largest_share <= SURE_SHARE * plateau)
         if is_sure.sum() < 0.5 * is_open.sum():
             is_sure = is_open
         is_good = is_sure & ~_odd_by_units(data, is_sure, visits)
         form = drift_form(data, visits, is_good)
-        scales = placement_scales(data, placements)
-        data = with_likeliest_scale(data, scales, form, is_good)
         is_good, fit = without_odd(data, form, is_good)
         if len(responses[0].mean_adu) == 1:
             break
@@ -145,14 +145,12 @@ def calibrate_radiometric(
     is_good, fit = without_odd(data, form, is_good)
     is_used, _ = trimmed(data, form, is_good | (is_open & ~is_sure))
     form = offset_form(data.only(is_used), form)
-    fit = fit_law_of_any_scale(
-        data.only(is_used), form, [scale[is_used] for scale in scales], SCALE_ODDS[: len(scales)]
-    )
+    fit = fit_law(data.only(is_used), form)
     check_fit(fit, visits, is_used, placements)
     return _judged(visits, placements, data, dark, fit, is_used, curve_words, plateau, full_scale_adu, is_seen=is_seen)
 
 
-def _data(visits: Visits, placements: Sequence[Placement], dark: PatchDark) -> LampData:
+def _data(visits: Visits, placements: Sequence[Placement], dark: PatchDark, distance_error_m: float) -> LampData:
     per_m = np.array([0.0 if one.distance_m is None else -2.0 / one.distance_m for one in placements])
     return LampData(
         log_share=visits.log_share,
@@ -163,8 +161,8 @@ def _data(visits: Visits, placements: Sequence[Placement], dark: PatchDark) -> L
         lever_per_adu=visits.lever_per_adu,
         dark_uncertainty_adu=dark.uncertainty_adu,
         time=visits.time,
-        placement_scale=np.ones_like(visits.log_share),
         dex_per_m=per_m[visits.placement] / math.log(10.0),
+        distance_error_m=distance_error_m,
     )
 
 
@@ -231,12 +229,10 @@ def _judged(
         drift_error = float(fit.drift_error_dex[0]) * math.log(10.0)
     limits = _limits(visits, fit, dark, response, exposure, error, drift, is_seen=is_seen)
     remarks = [*limits, curve_words]
-    if used.dex_per_m.any() and not fit.form.has_offset:
-        further = fit_law(replace(used, log_level=used.log_level + TAPE_ERROR_M * used.dex_per_m), fit.form)
-        change = float(further.parameters[0] - fit_law(used, fit.form).parameters[0])
+    if used.dex_per_m.any():
         remarks.append(
-            f"r_resp would be {abs(change):.4f} {'larger' if change > 0 else 'smaller'} if all distances were "
-            f"{m_to_mm(TAPE_ERROR_M):.0f} mm longer: measure them from the filament to the diffuser"
+            f"distances from filament to diffuser were taken as right within {m_to_mm(data.distance_error_m):.2g} mm, "
+            "each and all together; the uncertainties count that"
         )
     n_left = int((tried & ~is_used).sum())
     if n_left:
@@ -277,7 +273,8 @@ def _limits(
     """What makes the calibration less than good, one text each."""
     limits = []
     if error_share > GOOD_SHARE:
-        limits.append(f"intensities are known within {error_share:.1%} only (aim {GOOD_SHARE:.0%}): use more levels")
+        remedy = "measure distances better (--distance-error-mm), or use larger ones or more levels"
+        limits.append(f"intensities are known within {error_share:.1%} only (aim {GOOD_SHARE:.0%}): {remedy}")
     if math.isnan(drift_share):
         limits.append("no exposure was repeated later at the same level: a drift of the lamp could not be seen")
     if fit.form.has_offset:

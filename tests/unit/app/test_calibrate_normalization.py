@@ -13,8 +13,11 @@ import cv2
 import numpy as np
 import pytest
 
+from namod_ctl.app.calibration_files import new_header, write_calibration
 from namod_ctl.app.cli import main
+from namod_ctl.app.config.calibration_schema import GeometryCalibration
 from namod_ctl.app.config.instrument import load_config
+from namod_ctl.app.report.of_run import run_report
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.records import Record, RejectReason
 from namod_ctl.core.units import arcmin_to_rad, deg_to_rad
@@ -113,6 +116,35 @@ def test_reconstruct_leaves_it_where_it_is_told_to(run, namod_ctl):
     assert "still in the responses" in said
     remarks = json.loads((run / "alignment.json").read_text())["remarks"]
     assert not any(remark.startswith("self-calibration") for remark in remarks)
+    document, _ = run_report(run)
+    assert f"namod-ctl reconstruct {run.name} --no-self-calibration" in str(document)
+
+
+def test_the_report_keeps_what_was_taken_out(run, namod_ctl):
+    code, said = namod_ctl("reconstruct", run)
+    assert code == 0, said
+    document, _ = run_report(run)
+    assert "--no-self-calibration" not in str(document)
+
+
+def test_rereduce_leaves_it_where_it_is_told_to(run, tmp_path, namod_ctl):
+    section = load_config("fact").star_camera
+    geometry = GeometryCalibration(
+        kind="geometry",
+        plate_scale_mdeg_per_px=section.plate_scale_mdeg_per_px,
+        plate_scale_uncertainty_mdeg_per_px=0.001,
+        residual_rms_px=0.1,
+        method="by hand",
+        n_points=2,
+        **new_header(section, "star_camera", SystemClock(), source="by hand"),
+    )
+    write_calibration(tmp_path / "geometry.json", geometry)
+    for name, switch in (("on", "--self-calibration"), ("off", "--no-self-calibration")):
+        out = tmp_path / name
+        code, said = namod_ctl("rereduce", run, "--calibration", tmp_path / "geometry.json", "--out", out, switch)
+        assert code == 0, said
+        remarks = json.loads((out / "alignment.json").read_text())["remarks"]
+        assert any(remark.startswith("self-calibration") for remark in remarks) == (name == "on")
 
 
 def test_a_lamp_in_steps(tmp_path, namod_ctl):

@@ -123,6 +123,12 @@ def test_bad_input_writes_no_file(night, tmp_path, arguments, message):
     assert not out.exists()
 
 
+def test_the_picture_never_takes_the_place_of_the_calibration(tmp_path):
+    with pytest.raises(ConfigError, match=r"end it with \.json"):
+        call("--twin", "--out", tmp_path / "geometry.png")
+    assert not list(tmp_path.iterdir())
+
+
 def test_wrong_place_is_refused(night, tmp_path):
     folder, _, near = night
     ra_deg, dec_deg = (float(text) for text in near.split(","))

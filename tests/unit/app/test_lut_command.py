@@ -6,6 +6,8 @@ import csv
 import itertools
 import json
 import math
+import shutil
+import signal
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from io import StringIO
@@ -35,6 +37,7 @@ from namod_ctl.app.build.run_zenith import when_facets_were_seen, zenith_of_run
 from namod_ctl.app.commands.lut import app
 from namod_ctl.app.config.instrument import load_config
 from namod_ctl.app.config.schema import SiteSection
+from namod_ctl.app.end_signals import ended_in_order
 from namod_ctl.app.lut.application import apply_table
 from namod_ctl.app.lut.files import lut_from_json, lut_to_json, read_lut
 from namod_ctl.calibration.gravity.gravity_table import GravityTable
@@ -44,7 +47,7 @@ from namod_ctl.core.errors import ConfigError, NamodError
 from namod_ctl.core.motion import MoveOrder
 from namod_ctl.core.units import deg_to_rad, rad_to_deg
 from namod_ctl.cycle.control import ControlBox, Request, RequestKind, send
-from namod_ctl.cycle.table_move import moved_legs, noted_baseline, noted_zenith_deg
+from namod_ctl.cycle.table_move import halted_legs, moved_legs, noted_baseline, noted_zenith_deg
 from namod_ctl.store.campaign import CampaignStore
 from namod_ctl.store.run import RunStore
 from namod_ctl.twin.reflector import TwinReflector
@@ -179,6 +182,9 @@ def test_wrong_runs_are_refused(runs: list[Path], tmp_path: Path) -> None:
     out = tmp_path / "LUT.json"
     assert "named twice" in refusal("fit", runs[0], runs[1], runs[0], "--out", out)
     assert "no run" in refusal("fit", runs[0], runs[1], tmp_path, "--out", out)
+    copy = tmp_path / "copy"
+    shutil.copytree(runs[0], copy)
+    assert "copy of that run" in refusal("fit", runs[0], runs[1], copy, "--out", out)
     assert "at least 3 are needed" in refusal("fit", runs[0], runs[1], "--out", out)
     assert "is a folder" in refusal("fit", *runs, "--out", tmp_path)
     assert "does not exist" in refusal("fit", *runs, "--out", tmp_path / "nowhere" / "LUT.json")
@@ -399,6 +405,59 @@ def test_a_stop_from_another_terminal_halts_and_the_table_goes_on_later(
     for leg, stands_m in at_m.items():
         travel_m = mounts[leg.facet_id].travel_of_tilt(tilts[table.facet_ids.index(leg.facet_id)])[leg.index]
         assert stands_m == pytest.approx(baseline.position_m[leg] + travel_m, abs=2e-6)
+
+
+@pytest.mark.parametrize("end", [KeyboardInterrupt(), SystemExit(143)])
+def test_an_interrupt_on_the_way_halts_and_is_journaled(
+    end: BaseException, lut: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    journal = tmp_path / "moves"
+    table, console = few_facets(read_lut(lut).table), Console(file=StringIO(), soft_wrap=True)
+    look, looks = ControlBox.poll, itertools.count(1)
+
+    def interrupted(box: ControlBox) -> list[Request]:
+        if next(looks) == 6:
+            raise end
+        return look(box)
+
+    monkeypatch.setattr(ControlBox, "poll", interrupted)
+
+    def go(aligned_rad: float | None) -> bool:
+        return apply_table(table, config(), deg_to_rad(60.0), aligned_rad, None, journal, TWIN, console, is_yes=True)
+
+    with pytest.raises(type(end)):
+        go(deg_to_rad(30.0))
+    assert "Stopped: " in told_by(console)
+    with CampaignStore.open(journal) as store:
+        assert store.events()[-1].kind == "lut_stopped"
+        assert not store.unfinished_orders()
+        assert noted_zenith_deg(store) is None
+        assert halted_legs(store)
+    assert go(None)
+    with CampaignStore.open(journal) as store:
+        assert noted_zenith_deg(store) == pytest.approx(60.0)
+
+
+def test_a_closed_terminal_ends_it_in_order_and_nohup_is_heeded() -> None:
+    with pytest.raises(SystemExit), ended_in_order():
+        signal.raise_signal(signal.SIGHUP)
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with ended_in_order():
+            signal.raise_signal(signal.SIGHUP)
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_a_table_of_other_facets_is_refused(reflector: TwinReflector, tmp_path: Path) -> None:
+    huge = true_lut(reflector)
+    path = tmp_path / "LUT.json"
+    text = json.loads(write_lut(path, huge).read_text())
+    left_out = text["facets"].pop()["id"]
+    path.write_text(json.dumps(text))
+    assert f"has other facets than the config of FACT: {left_out}" in refusal(
+        "apply", path, "--zenith-deg", 40, "--aligned-at-deg", 20, "--twin", "--yes"
+    )
 
 
 def test_a_leg_that_would_go_too_far_leaves_its_whole_facet(reflector: TwinReflector, tmp_path: Path) -> None:

@@ -31,6 +31,7 @@ class Case:
     law: str
     uses_levels: bool = False
     distance_error_m: float = 0.0
+    common_distance_error_m: float = 0.0
     level_error_share: float = 0.0
     n_channels: int = 1
     black_level_adu: float = 0.0
@@ -39,6 +40,11 @@ class Case:
     r_curve: float = 0.0
     fall_off_share: float = 0.0
     distances_m: tuple[float, ...] = DISTANCES_M
+
+    @property
+    def stated_distance_error_m(self) -> float:
+        """What the person says of the distances: the truth, of each and of all together."""
+        return max(self.distance_error_m, self.common_distance_error_m)
 
     @property
     def true_parameters(self) -> np.ndarray:
@@ -83,6 +89,7 @@ def twin_lamp(case: Case, seed: int) -> TwinLamp:
         drift_share_per_hour=case.drift,
         level_error_share=case.level_error_share,
         distance_error_m=case.distance_error_m,
+        distance_offset_m=case.common_distance_error_m * np.random.default_rng([seed, 1]).standard_normal(),
         cosmic_rays_per_s=0.2,
         fall_off_share=case.fall_off_share,
     )
@@ -112,7 +119,12 @@ def series_of_twin(case: Case, seed: int) -> tuple[RadiometricFinding, np.ndarra
     assert series.patch is not None
     assert series.dark is not None
     finding = calibrate_radiometric(
-        series.responses, series.placements, series.dark, series.patch.n_pixels, FULL_SCALE_ADU
+        series.responses,
+        series.placements,
+        series.dark,
+        series.patch.n_pixels,
+        FULL_SCALE_ADU,
+        case.stated_distance_error_m,
     )
     return finding, truth
 

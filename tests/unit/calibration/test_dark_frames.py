@@ -62,6 +62,18 @@ def test_colour_frames_have_the_same_hot_pixels() -> None:
     assert found.bias_adu == pytest.approx(8.0, abs=0.05)
 
 
+def test_cosmic_rays_in_one_frame_of_few_pixels_are_no_light() -> None:
+    frames = dark_frames(n_cosmic=0)
+    hit = frames[-2].image.copy()
+    rng = np.random.default_rng(12)
+    hit[rng.integers(20, 80, 60), rng.integers(0, COLUMNS, 60)] = 220
+    frames[-2] = replace(frames[-2], image=hit)
+    found = measure_dark_frames(frames, 255.0)
+    assert found.bias_adu == pytest.approx(8.0, abs=0.05)
+    assert found.n_cosmic_rays == pytest.approx(60, abs=4)
+    assert len(found.hot_xy) == len(HOT)
+
+
 @pytest.mark.parametrize("level", [-0.4, 0.0, 0.3, 0.8, 2.0])
 def test_level_is_found_behind_the_floor_at_zero(level: float) -> None:
     rng = np.random.default_rng(3)

@@ -165,7 +165,25 @@ def test_distances_not_measured_from_the_filament() -> None:
     assert finding.fit.offset_m == pytest.approx(0.04, abs=4.0 * finding.fit.offset_error_m)
     error = np.sqrt(np.diag(finding.fit.covariance))[:3]
     assert np.all(np.abs(finding.fit.parameters - truth)[:3] < 3.5 * error)
-    assert any("filament" in remark for remark in calibrated(series).remarks)
+
+
+def test_common_error_of_all_distances_is_in_the_uncertainties() -> None:
+    """The person believes 8 mm less than what is true, and said 5 mm: law and intensities are as sure as they say."""
+    series, truth = recorded(SHORT, 7)
+    believed = [at_distance((placement.distance_m or 0.0) - 0.008) for placement in series.placements]
+    finding = calibrated(replace(series, placements=believed))
+    assert not finding.fit.form.has_offset
+    error = np.sqrt(np.diag(finding.fit.covariance))[:3]
+    assert np.all(np.abs(finding.fit.parameters - truth)[:3] < 3.0 * error)
+    assert any("right within 5 mm" in remark for remark in finding.remarks)
+
+
+def test_an_offset_larger_than_was_said_is_taken_off_only_where_it_is_sure() -> None:
+    """Seven placements with errors of 2 mm look, by chance, as if all distances were 6 mm too short."""
+    finding, truth = series_of_twin(SHORT, 4)
+    assert not finding.fit.form.has_offset
+    error = np.sqrt(np.diag(finding.fit.covariance))[:3]
+    assert np.all(np.abs(finding.fit.parameters - truth)[:3] < 3.0 * error)
 
 
 def test_lamp_seen_as_a_disc(short_series: LampSeries) -> None:
@@ -215,7 +233,6 @@ def test_fit_gives_the_closed_form_of_generalized_least_squares() -> None:
         lever_per_adu=np.zeros(60),
         dark_uncertainty_adu=0.0,
         time=np.zeros(60),
-        placement_scale=np.ones(60),
         dex_per_m=np.zeros(60),
     )
     fit = fit_law(data, LawForm(drift_degree=0))

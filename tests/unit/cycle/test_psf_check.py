@@ -156,6 +156,21 @@ def test_comparison(seen, estimate, words):
     assert f"{estimate[0]:.2f} +- {estimate[1]:.2f} arcmin2" in text
 
 
+@pytest.mark.parametrize(
+    ("uncertainty", "words"),
+    [
+        (0.002, "is 6.300 +- 0.002 arcmin2"),
+        (1e-9, "is 6.3000 +- 0.0000 arcmin2"),
+        (math.nan, "(uncertainty not stated)"),
+    ],
+)
+def test_what_is_stated_of_an_estimate_is_told(uncertainty, words):
+    found = Comparison(2, *(arcmin2_to_rad2(area) for area in (6.1, 0.05, 6.3, uncertainty)))
+    assert words in found.text
+    assert "they agree" in found.text
+    assert found.sigmas == pytest.approx(-0.2 / math.hypot(0.05, 0.04 * 6.3), rel=1e-4)
+
+
 def test_coma_of_a_star_off_the_axis_is_taken_off():
     """FACT, aligned, ray traced: 5.39 arcmin2 on the axis, 5.95 with the star 0.35 deg off (`namod-ctl raytrace`)."""
     rays = trace(REFLECTOR, 4000, deg_to_rad(np.array([0.21, 0.28])))

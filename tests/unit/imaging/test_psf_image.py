@@ -141,12 +141,15 @@ def test_sixteen_bit_and_colour():
     assert abs(relative(measure_psf(frame, deep, 0.1), math.pi * 63.0)[0]) < 0.02
     colours = np.stack([frame_of(light / 80.0, rng) for _ in range(3)], axis=-1)
     assert abs(relative(measure_psf(colours, CAMERA, 0.1), math.pi * 63.0)[0]) < 0.02
+    colours[100, 200] = (20, 250, 30)  # a hot pixel, in one colour
+    assert abs(relative(measure_psf(colours, CAMERA, 0.1), math.pi * 63.0)[0]) < 0.02
 
 
 @pytest.mark.parametrize(
     ("light", "words"),
     [
         (np.zeros(SHAPE), "no star in the image"),
+        (np.full(SHAPE, 5000.0), "most of the image is saturated"),
         (400.0 * gaussian_light(SHAPE, 150.0, 120.0, 8.0), "saturated"),
         (100.0 * gaussian_light(SHAPE, 10.0, 120.0, 8.0), "edge of the image"),
         (100.0 * gaussian_light(SHAPE, 28.0, 120.0, 8.0), "edge of the image"),
@@ -158,7 +161,17 @@ def test_sixteen_bit_and_colour():
         (100.0 * gaussian_light(SHAPE, 150.2, 120.1, 0.9), "too sharp"),
         (100.0 * gaussian_light(SHAPE, 150.0, 120.0, 46.0), "edge of the image|another star"),
     ],
-    ids=["empty", "saturated", "cut", "close to the edge", "two stars", "faint", "sharp", "larger than the field"],
+    ids=[
+        "empty",
+        "saturated all over",
+        "saturated",
+        "cut",
+        "close to the edge",
+        "two stars",
+        "faint",
+        "sharp",
+        "larger than the field",
+    ],
 )
 def test_what_cannot_be_measured_is_refused(light, words):
     with pytest.raises(DataQualityError, match=words):

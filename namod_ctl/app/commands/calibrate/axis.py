@@ -25,7 +25,7 @@ from namod_ctl.app.calibration_files import (
 from namod_ctl.app.config.calibration_schema import AxisCalibration
 from namod_ctl.app.config.instrument import load_config
 from namod_ctl.app.pictures.axis_picture import draw_axis
-from namod_ctl.app.pictures.figure_style import figure_to_png
+from namod_ctl.app.pictures.figure_style import figure_to_png, picture_beside
 from namod_ctl.calibration.geometry.optical_axis import AxisFit, AxisPosition, combine_axis
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.errors import ConfigError
@@ -77,7 +77,7 @@ def axis(
     _check_choice(runs, series, is_twin=twin)
     if out is not None:
         check_calibration_output(out, force=force)
-        check_calibration_output(out.with_suffix(".png"), force=force)
+        check_calibration_output(picture_beside(out), force=force)
     loaded = load_config(config)
     instrument = build_instrument(loaded)
     camera = instrument.star_camera
@@ -140,9 +140,10 @@ def axis(
     if out is None:
         console.print("Nothing was written. To keep it, say where with --out FILE.")
         return
+    picture, png = picture_beside(out), figure_to_png(draw_axis(fit, positions, names, camera))
     write_calibration(out, calibration, force=force)
-    write_file_durably(out.with_suffix(".png"), figure_to_png(draw_axis(fit, positions, names, camera)))
-    console.print(f"Written: {out}, and a picture: {out.with_suffix('.png')}")
+    write_file_durably(picture, png)
+    console.print(f"Written: {out}, and a picture: {picture}")
     console.print(how_to_use(out, calibration))
 
 

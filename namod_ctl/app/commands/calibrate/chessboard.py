@@ -23,7 +23,7 @@ from namod_ctl.app.calibration_files import (
 from namod_ctl.app.config.calibration_schema import CameraRole, DistortionSection, GeometryCalibration
 from namod_ctl.app.config.instrument import load_config
 from namod_ctl.app.pictures.chessboard_picture import draw_chessboard
-from namod_ctl.app.pictures.figure_style import figure_to_png
+from namod_ctl.app.pictures.figure_style import figure_to_png, picture_beside
 from namod_ctl.app.views.calibration_rows import values_in_words
 from namod_ctl.calibration.geometry.chessboard import BoardView, ChessboardFit, calibrate_with_boards, find_board
 from namod_ctl.core.clock import SystemClock
@@ -78,7 +78,7 @@ def chessboard(
         raise ConfigError("give FRAMES of the board, or --twin for a rehearsal (one of both)")
     if out is not None:
         check_calibration_output(out, force=force)
-        check_calibration_output(out.with_suffix(".png"), force=force)
+        check_calibration_output(picture_beside(out), force=force)
     loaded = load_config(config)
     instrument = build_instrument(loaded)
     model = instrument.star_camera if camera == "star" else instrument.reflector_camera
@@ -141,9 +141,10 @@ def chessboard(
     if out is None:
         console.print("Nothing was written. To keep it, say where with --out FILE.")
         return
+    picture, png = picture_beside(out), figure_to_png(draw_chessboard(fit, model))
     write_calibration(out, calibration, force=force)
-    write_file_durably(out.with_suffix(".png"), figure_to_png(draw_chessboard(fit, model)))
-    console.print(f"Written: {out}; look at {out.with_suffix('.png')}: the corners must fill the image.")
+    write_file_durably(picture, png)
+    console.print(f"Written: {out}; look at {picture}: the corners must fill the image.")
     console.print(how_to_use(out, calibration))
 
 
@@ -162,6 +163,8 @@ def _views(
             views.append(view)
     for problem in series.problems:
         console.print(f"left out: {problem}")
+    if not n_frames:
+        raise DataQualityError("no frame can be read: give PNG, TIFF or FITS files of unsigned integers")
     if not views:
         raise DataQualityError(
             f"no board with {corners[0]}x{corners[1]} inner corners in {n_frames} frames: count the corners between "

@@ -14,6 +14,7 @@ from namod_ctl.app.build.stored_lamp_series import read_stored_darks
 from namod_ctl.app.calibration_files import (
     DEFAULT_VALID_DAYS,
     check_calibration_output,
+    check_valid_days,
     how_to_use,
     new_header,
     write_calibration,
@@ -61,6 +62,7 @@ def dark(
     if frames is None and exposure_unit is not Unit.SECONDS:
         raise ConfigError("--exposure-unit is that of --frames; cameras are told seconds")
     check_calibration_output(path, force=force)
+    check_valid_days(valid_days)
     section = loaded.star_camera if camera is CalibratedCamera.STAR else loaded.reflector_camera
     if frames is not None:
         darks = read_stored_darks(frames, section, exposure_unit.value, recording_range_s(loaded))

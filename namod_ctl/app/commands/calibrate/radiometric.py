@@ -17,21 +17,27 @@ from namod_ctl.app.build.stored_lamp_series import read_stored_series
 from namod_ctl.app.calibration_files import (
     DEFAULT_VALID_DAYS,
     check_calibration_output,
+    check_valid_days,
     how_to_use,
     new_header,
     write_calibration,
 )
 from namod_ctl.app.config.calibration_schema import LawSection, RadiometricCalibration
 from namod_ctl.app.config.instrument import InstrumentConfig, load_config
-from namod_ctl.app.pictures.figure_style import figure_to_png
+from namod_ctl.app.pictures.figure_style import figure_to_png, picture_beside
 from namod_ctl.app.pictures.radiometric_plot import draw_radiometric
 from namod_ctl.app.views.radiometric_table import radiometric_table
 from namod_ctl.calibration.lamp.exposure_ratio import exposure_ratio
 from namod_ctl.calibration.lamp.lamp_series import Placement, at_distance, at_level
 from namod_ctl.calibration.lamp.lamp_visits import visits_of
-from namod_ctl.calibration.lamp.radiometric_verdict import RadiometricFinding, calibrate_radiometric
+from namod_ctl.calibration.lamp.radiometric_verdict import (
+    DISTANCE_ERROR_M,
+    RadiometricFinding,
+    calibrate_radiometric,
+)
 from namod_ctl.core.clock import SystemClock
 from namod_ctl.core.errors import ConfigError
+from namod_ctl.core.units import m_to_mm, mm_to_m
 from namod_ctl.cycle.lamp_recording import (
     LampSeries,
     SeriesPlan,
@@ -42,6 +48,8 @@ from namod_ctl.cycle.lamp_recording import (
 from namod_ctl.store.frames import write_file_durably
 
 N_DARKS = 3
+DEFAULT_DISTANCE_ERROR_MM = m_to_mm(DISTANCE_ERROR_M)
+MAX_DISTANCE_ERROR_MM = 100.0
 DEFAULT_DISTANCES = "0.5,0.65,0.85,1.1,1.4,1.8,2.3,3,3.9,5"
 
 _Say = Callable[[str], None]
@@ -90,6 +98,14 @@ def radiometric(
         str | None,
         typer.Option("--levels", metavar="L,L,...", help="Relative light of the lamp (filters) instead of distances."),
     ] = None,
+    distance_error_mm: Annotated[
+        float,
+        typer.Option(
+            "--distance-error-mm",
+            help="How well distances from filament to diffuser are known, each and all together (1 sigma); the "
+            "uncertainties count it.",
+        ),
+    ] = DEFAULT_DISTANCE_ERROR_MM,
     free_levels: Annotated[
         bool, typer.Option("--free-levels", help="Do not trust the levels: tells r_expo / r_resp only, writes no file.")
     ] = False,
@@ -111,11 +127,17 @@ def radiometric(
     """
     loaded = load_config(config)
     path = out or Path(f"{camera.role}_radiometric.json")
-    picture = path.with_suffix(".png")
+    picture = picture_beside(path)
     if frames is not None and twin:
         raise ConfigError("--frames and --twin: choose one; stored frames need no twin")
     if frames is None and exposure_unit is not Unit.SECONDS:
         raise ConfigError("--exposure-unit is that of --frames; cameras are told seconds")
+    if not 0.0 <= distance_error_mm <= MAX_DISTANCE_ERROR_MM:
+        raise ConfigError(
+            f"--distance-error-mm {distance_error_mm:g}: must be 0 to {MAX_DISTANCE_ERROR_MM:g} mm; measure the "
+            "distances better than that, or give --levels"
+        )
+    check_valid_days(valid_days)
     if not free_levels:
         check_calibration_output(path, force=force)
         check_calibration_output(picture, force=force)
@@ -133,7 +155,9 @@ def radiometric(
     if free_levels:
         _say_ratio(series, n_pixels, full_scale_adu, section.radiometric_law.r_expo / section.radiometric_law.r_resp)
         return
-    finding = calibrate_radiometric(series.responses, series.placements, series.dark, n_pixels, full_scale_adu)
+    finding = calibrate_radiometric(
+        series.responses, series.placements, series.dark, n_pixels, full_scale_adu, mm_to_m(distance_error_mm)
+    )
     header = new_header(
         section,
         camera.role,

@@ -25,16 +25,18 @@ from namod_ctl.app.calibration_files import (
 )
 from namod_ctl.app.config.calibration_schema import GeometryCalibration
 from namod_ctl.app.config.instrument import InstrumentConfig, load_config
-from namod_ctl.app.pictures.figure_style import figure_to_png
+from namod_ctl.app.pictures.figure_style import figure_to_png, picture_beside
 from namod_ctl.app.pictures.star_field_plot import draw_star_field
 from namod_ctl.app.views.star_field_table import geometry_table, star_table, where_it_looked
 from namod_ctl.calibration.geometry.field_geometry import FieldGeometry, Hint, Watch, solve_field
-from namod_ctl.calibration.geometry.star_field import field_of_frames, stars_of_frame
+from namod_ctl.calibration.geometry.star_field import FrameStars, field_of_frames, stars_of_frame
 from namod_ctl.calibration.sky.observed_sky import Site
 from namod_ctl.calibration.sky.star_catalogue import EPOCH_YEAR, bright_stars, number_of_star
 from namod_ctl.core.clock import SystemClock
-from namod_ctl.core.errors import ConfigError
+from namod_ctl.core.errors import ConfigError, DataQualityError
 from namod_ctl.core.units import deg_to_rad, rad_to_deg, rad_to_mdeg
+from namod_ctl.imaging.radiometry import Frame
+from namod_ctl.optics.camera_model import CameraModel
 from namod_ctl.store.frames import write_file_durably
 from namod_ctl.twin.star_field import Lens
 
@@ -96,7 +98,7 @@ def star_field(
     Example: namod-ctl calibrate star-field night/*.fits --config fact --near Sadr --out geometry.json
     """
     loaded = load_config(config)
-    picture = out.with_suffix(".png")
+    picture = picture_beside(out)
     check_calibration_output(out, force=force)
     check_calibration_output(picture, force=force)
     console = Console(highlight=False, markup=False, soft_wrap=True)
@@ -121,15 +123,19 @@ def star_field(
     else:
         given = _stored(frames or [], time, where)
     camera = instrument.star_camera
-    found = [stars_of_frame(image, camera, instrument.star_size_rad) for image in given.images]
+    found = [
+        _stars(image, name, camera, instrument.star_size_rad)
+        for image, name in zip(given.images, given.names, strict=True)
+    ]
     field = field_of_frames(found, given.names, camera)
     hint = None if near is None else Hint(_direction(near), deg_to_rad(radius))
     watch = Watch(given.moment or SystemClock().now(), given.site if given.moment is not None else None)
     geometry = solve_field(field.stars, catalogue, camera, instrument.star_size_rad, watch, hint)
     calibration = _calibration(geometry, loaded, given, valid_days)
-    write_calibration(out, calibration, force=force)
     title = f"{camera.name}: {given.source}, {len(field.stars.pixel)} lights"
-    write_file_durably(picture, figure_to_png(draw_star_field(geometry, field.stars, camera, catalogue, title)))
+    png = figure_to_png(draw_star_field(geometry, field.stars, camera, catalogue, title))
+    write_calibration(out, calibration, force=force)
+    write_file_durably(picture, png)
     console.print(star_table(geometry, field.stars.pixel, catalogue))
     console.print(geometry_table(geometry, camera))
     console.print(where_it_looked(geometry) + " Compare it with what the telescope says.")
@@ -140,6 +146,13 @@ def star_field(
         console.print(_truth(given.truth))
     console.print(f"Written to {out}, and the picture to {picture}: look at it.")
     console.print(how_to_use(out, calibration))
+
+
+def _stars(image: Frame, name: str, camera: CameraModel, star_size_rad: float) -> FrameStars:
+    try:
+        return stars_of_frame(image, camera, star_size_rad)
+    except (ConfigError, DataQualityError) as problem:
+        raise type(problem)(f"{name}: {problem}") from None
 
 
 def _stored(sources: list[Path], time: str | None, site: Site | None) -> _Input:

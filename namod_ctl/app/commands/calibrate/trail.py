@@ -26,7 +26,7 @@ from namod_ctl.app.calibration_files import (
 )
 from namod_ctl.app.config.calibration_schema import DistortionSection, GeometryCalibration
 from namod_ctl.app.config.instrument import InstrumentConfig, load_config
-from namod_ctl.app.pictures.figure_style import figure_to_png
+from namod_ctl.app.pictures.figure_style import figure_to_png, picture_beside
 from namod_ctl.app.pictures.trail_picture import draw_trail
 from namod_ctl.app.views.calibration_rows import values_in_words
 from namod_ctl.calibration.geometry.star_streak import StreakFit, fit_streak
@@ -114,7 +114,7 @@ def trail(
         raise ConfigError("--twin makes frames of its own: leave FRAMES out, or --twin")
     if out is not None:
         check_calibration_output(out, force=force)
-        check_calibration_output(out.with_suffix(".png"), force=force)
+        check_calibration_output(picture_beside(out), force=force)
     site = _site(loaded)
     console = Console(soft_wrap=True, highlight=False, markup=False)
     true_camera = None
@@ -166,8 +166,8 @@ def trail(
         return
     write_calibration(out, calibration, force=force)
     if png is not None:
-        write_file_durably(out.with_suffix(".png"), png)
-        console.print(f"Written: {out}; look at {out.with_suffix('.png')}: residuals must be without a pattern.")
+        write_file_durably(picture_beside(out), png)
+        console.print(f"Written: {out}; look at {picture_beside(out)}: residuals must be without a pattern.")
     else:
         console.print(f"Written: {out}")
     console.print(how_to_use(out, calibration))

@@ -80,6 +80,29 @@ def test_a_lamp_shows_the_slope_to_a_tenth_of_a_per_cent(levels, exponent):
     assert found.per_magnitude_uncertainty < 0.002
 
 
+def test_scintillation_of_a_bright_star_is_no_slope():
+    """A bright star is exposed shortly and scintillates more; its mean is kept, so the mean of its log falls.
+
+    Young's formula: variance goes as one over the exposure. Here 25 % at 0 mag, so half its variance are 3 % of light,
+    and 0.3 % at 2.5 mag: a mean of logs would have an exponent of 0.012.
+    """
+    rng = np.random.default_rng(12)
+    errors = []
+    for _ in range(6):
+        magnitude = 1.25 - 1.25 * np.cos(2.0 * np.pi * np.arange(2000) / 200.0)
+        table = at_rest(rng, magnitude)
+        sigma = 0.25 * 10.0 ** (-0.2 * magnitude)
+        factor = np.exp(sigma * rng.normal(size=2000) - sigma**2 / 2.0)
+        found = measure_at_rest(
+            replace(table, response=table.response / factor[:, None], faintness=table.faintness / factor)
+        )
+        errors.append((found.exponent, found.exponent_uncertainty))
+    exponent, uncertainty = np.array(errors).T
+    assert uncertainty.max() < 0.008
+    assert abs(exponent.mean()) < 0.006
+    assert np.sqrt(np.mean((exponent / uncertainty) ** 2)) < 2.0
+
+
 def test_slopes_per_magnitude_and_per_decade_are_one_power_law():
     """Two and a half magnitudes are a decade; the paper's -6.9 % per magnitude are then +19.6 % per decade."""
     found = measure_at_rest(at_rest(np.random.default_rng(4), np.repeat(np.linspace(0, 5, 8), 10), EXPONENT))
