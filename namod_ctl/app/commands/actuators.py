@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
+from namod_ctl.app.approval import ask_before_moving
 from namod_ctl.app.build.actuators import build_bus_settings, build_motion_settings, open_actuators
 from namod_ctl.app.build.twin_actuators import build_twin_actuators, twin_wiring
 from namod_ctl.app.config.instrument import InstrumentConfig, load_config
@@ -120,7 +120,9 @@ def home(
         chosen = rig.chosen(legs, is_all=all_)
         states = rig.mover.read_states(chosen)
         rig.console.print(table_of_words("stands at", {leg: _standing(state) for leg, state in states.items()}))
-        _ask(f"{counted(len(chosen), 'leg')} to be brought to the reference, wherever that is. Go on?", is_yes=yes)
+        ask_before_moving(
+            f"{counted(len(chosen), 'leg')} to be brought to the reference, wherever that is. Go on?", is_yes=yes
+        )
         homed = rig.mover.home(chosen, lambda: None)
         rig.console.print(table_of_words("result", {leg: words or "homed" for leg, words in homed.items()}))
     _leave(is_complete=not any(homed.values()))
@@ -198,7 +200,7 @@ def selftest(
     """
     with _rig(config, is_twin=twin) as rig:
         chosen = rig.chosen(legs, is_all=all_)
-        _ask(
+        ask_before_moving(
             f"{counted(len(chosen), 'leg')} to go {travel_mm:g} mm up and back, one after the other. Go on?", is_yes=yes
         )
         tests = []
@@ -247,7 +249,7 @@ def _carry_out(
         if not allowed:
             rig.console.print("nothing was moved")
             _leave(is_complete=False)
-        _ask(f"{counted(len(allowed), 'leg')} to move. Go on?", is_yes=is_yes)
+        ask_before_moving(f"{counted(len(allowed), 'leg')} to move. Go on?", is_yes=is_yes)
         results = _execute(rig, allowed)
         rig.console.print(table_of_results(results))
     _leave(is_complete=not refused and all(result.outcome is MoveOutcome.ARRIVED for result in results))
@@ -344,20 +346,6 @@ def _standing(state: DriveState | str) -> str:
     if isinstance(state, str):
         return state
     return f"{m_to_mm(state.position_m):.4f} mm" if state.is_homed else "an unknown place: not homed"
-
-
-def _ask(question: str, *, is_yes: bool) -> None:
-    if is_yes:
-        return
-    try:
-        typer.confirm(question, abort=True)
-    except typer.Abort:
-        if sys.stdin.isatty():
-            raise
-        typer.echo()
-        raise ConfigError(
-            "nothing was moved: nobody answered yes. Without a terminal, write the answer beforehand: --yes"
-        ) from None
 
 
 def _leave(*, is_complete: bool) -> None:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-import sys
 from pathlib import Path
 
-import typer
 from rich.console import Console
 
+from namod_ctl.app.approval import ask_before_moving
 from namod_ctl.app.build.lut_motion import TableRig, open_table_rig
 from namod_ctl.app.config.instrument import InstrumentConfig
 from namod_ctl.app.end_signals import ended_in_order
@@ -73,7 +72,7 @@ def apply_table(
             console.print("The digital twin: a rehearsal, nothing real is moved.")
         if unfinished := rig.store.unfinished_orders():
             words = f"{counted(len(unfinished), 'leg')} had orders when the program was killed"
-            _ask(f"{words}; those that stand on their way are brought to their end. Go on?", is_yes=is_yes)
+            ask_before_moving(f"{words}; those that stand on their way are brought to their end. Go on?", is_yes=is_yes)
         rig.corrector.recover(rig.poll)
         for remark in rig.corrector.check():
             console.print(remark, markup=False, style="yellow")
@@ -85,7 +84,7 @@ def apply_table(
         )
         _show(plan, table, baseline.zenith_rad, to_rad, console)
         if plan.orders:
-            _ask(f"{counted(len(plan.orders), 'leg')} to move. Go on?", is_yes=is_yes)
+            ask_before_moving(f"{counted(len(plan.orders), 'leg')} to move. Go on?", is_yes=is_yes)
             is_complete = _carry_out(rig, plan, to_rad, console)
         else:
             if not plan.refused:
@@ -206,17 +205,3 @@ def _tell_truth(rig: TableRig, to_rad: float, console: Console) -> None:
         f"The twin's truth: at {rad_to_deg(to_rad):g} deg A_sigma is {ratio:.3f} times that of the same facets "
         "perfectly aligned."
     )
-
-
-def _ask(question: str, *, is_yes: bool) -> None:
-    if is_yes:
-        return
-    try:
-        typer.confirm(question, abort=True)
-    except typer.Abort:
-        if sys.stdin.isatty():
-            raise
-        typer.echo()
-        raise ConfigError(
-            "nothing was moved: nobody answered yes. Without a terminal, write the answer beforehand: --yes"
-        ) from None

@@ -22,7 +22,15 @@ from namod_ctl.twin.drives import TwinDrives
 from namod_ctl.twin.faults import FaultPlan
 from namod_ctl.twin.settings import FaultSpec, TwinSettings
 
-ACTUATED = ["bench_pylon", "fact_actuated", "fact_modbus_rtu", "fact_modbus_tcp", "fact_zaber", "mst_actuated"]
+ACTUATED = [
+    "bench_pylon",
+    "fact_actuated",
+    "fact_modbus_rtu",
+    "fact_modbus_tcp",
+    "fact_psf",
+    "fact_zaber",
+    "mst_actuated",
+]
 TRAVEL_M = 1e-3
 LONG_S = 10.0  # to travel 1 mm at 1 mm/s
 

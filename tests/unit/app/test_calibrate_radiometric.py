@@ -124,7 +124,7 @@ def refused(result: Result, match: str) -> None:
 
 def test_pictures_make_a_calibration(pictures: Path, config_path: Path, tmp_path: Path) -> None:
     out = tmp_path / "star.json"
-    result = run(radiometric, config_path, "--frames", pictures, "--out", out)
+    result = run(radiometric, config_path, "--frames", pictures, "--out", out, "--distance-error-mm", "1")
     assert result.exit_code == 0, result.output
     calibration = read_calibration(out)
     assert isinstance(calibration, RadiometricCalibration)
