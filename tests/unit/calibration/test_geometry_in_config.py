@@ -41,7 +41,7 @@ def directions_of_theta(theta, watch):
     return found / np.linalg.norm(found, axis=1, keepdims=True)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1])
 def test_theta_of_the_whole_image(seed, tmp_path, monkeypatch):
     rng = np.random.default_rng(seed)
     scene = rich_scene(rng, 12)

